@@ -8,7 +8,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # Every process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run environment test test-slow test-nightly test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity pictures schema reference docs notebooks fuzz clean
+.PHONY: run environment test test-slow test-nightly test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics pictures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -107,12 +107,6 @@ scaling: $(VENV)/.installed-dev
 
 numerics: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.numerics --markdown docs/numerics-table.md
-
-# OSM_TRAINING, OSM_HELD_OUT: OpenStreetMap extracts; OSM_TRAINING_AT: lat,lon of a junction; VALIDITY: further options
-validity: $(VENV)/.installed-dev
-	$(BIN)/python -m benchmarks.validity $(if $(OSM_TRAINING),--osm-training $(OSM_TRAINING)) \
-		$(if $(OSM_TRAINING_AT),--osm-training-at $(OSM_TRAINING_AT)) $(if $(OSM_HELD_OUT),--osm-held-out $(OSM_HELD_OUT)) \
-		$(if $(OSM_UNSEEN),--osm-unseen $(OSM_UNSEEN)) $(if $(OSM_UNSEEN_AT),--osm-unseen-at $(OSM_UNSEEN_AT)) $(VALIDITY)
 
 pictures: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.pictures

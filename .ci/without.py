@@ -114,22 +114,23 @@ class ReducedProgram:
         self.environment = {**os.environ, "PYTHONPATH": str(self.site), "EGVS_STORE": str(copy / "store")}
         report("wheel built and unpacked")
 
-    def python(self, *arguments: object) -> str:
-        """Run Python in the copy, and return what it prints; ends this program if it fails."""
+    def python(self, what: str, *arguments: object) -> str:
+        """Run Python in the copy, and return what it prints; if it fails, end this program and say what failed."""
         words = [sys.executable, *(str(argument) for argument in arguments)]
         done = subprocess.run(words, cwd=self.copy, env=self.environment, capture_output=True, text=True)
         if done.returncode:
-            sys.exit(f"{' '.join(words[1:4])} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
+            sys.exit(f"{what} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
         return done.stdout
 
     def egvs(self, *arguments: object) -> None:
         """Run a command of the program."""
-        self.python("-m", "egvs", *arguments)
-        report(f"egvs {' '.join(str(argument) for argument in arguments)}")
+        command = f"egvs {' '.join(str(argument) for argument in arguments)}"
+        self.python(command, "-m", "egvs", *arguments)
+        report(command)
 
     def check_modules(self, prefixes: Sequence[str]) -> None:
         """Import every module, and look for names of what is gone in their texts."""
-        if str(self.site) not in (printed := self.python("-c", IMPORT_ALL, *prefixes)):
+        if str(self.site) not in (printed := self.python("importing all modules", "-c", IMPORT_ALL, *prefixes)):
             sys.exit(f"the installed package was imported, not the reduced one: {printed}")
         naming = [
             str(path.relative_to(self.site))

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 import egvs
+from benchmarks.across_junctions.candidates import with_sites
 from benchmarks.realism import (
     DETECTOR,
     FRAMES,
@@ -34,7 +35,6 @@ from benchmarks.realism import (
     planned_scores,
     table_row,
 )
-from benchmarks.validity.junctions import with_sites
 from egvs.clouds.sweeps import DetectedBoxes, Detections, detections_in_roi
 from egvs.core.grid import FloatArray, Roi
 from egvs.sensors.sensor import rotation_world_sensor

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import egvs
-from benchmarks.validity import low_models
+from benchmarks.across_junctions import study_detectors
 from egvs.artefacts import parquet
 from egvs.core.progress import no_progress
 from egvs.extensions.validation import surrogates
@@ -32,9 +32,9 @@ SCENARIO = Path(__file__).parents[1] / "scenarios" / "nishishinjuku"
 FRAMES, APART_S, SEED = 250, 7.0, 3704
 MEASURE = "ap_mean_r40_iou70"
 MAIN = "expected_detections (detectors cluster+pointpillars)"
-FROM_SENSOR = f"expected_detections (detector {low_models.SENSOR})"
+FROM_SENSOR = f"expected_detections (detector {study_detectors.SENSOR})"
 EGVS = tuple(f"egvs (gamma {gamma}, voxel 0.25)" for gamma in (10, 2))
-DETECTORS = (low_models.SENSOR, low_models.LOW, *base.detector_names())
+DETECTORS = (study_detectors.SENSOR, study_detectors.LOW, *base.detector_names())
 
 
 def main() -> None:
@@ -60,11 +60,11 @@ def measure(out: Path, frames: int) -> JunctionScores:
     scenario = egvs.load(SCENARIO)
     with validation_run(scenario, out, FrameSampling(frames, APART_S), jobs=None, progress=no_progress) as validation:
         scene = validation.record.scene
-        task = SiteDetectionTask(validation.record, {name: low_models.make(name) for name in DETECTORS})
+        task = SiteDetectionTask(validation.record, {name: study_detectors.make(name) for name in DETECTORS})
         rows, _ = measure_detection(validation.frames, scene.roi, run_detectors(scene.sites, task))
         scored = surrogates.compute_surrogates(scenario, validation.folder / "scores", ("expected_detections", "egvs"))
-    egvs.run(egvs.load(SCENARIO, [f"score.detector={low_models.SENSOR}"]), out / low_models.SENSOR)
-    by_sensor = parquet.read_artefact(out / low_models.SENSOR / "scores.parquet", "scores")[0].to_pylist()
+    egvs.run(egvs.load(SCENARIO, [f"score.detector={study_detectors.SENSOR}"]), out / study_detectors.SENSOR)
+    by_sensor = parquet.read_artefact(out / study_detectors.SENSOR / "scores.parquet", "scores")[0].to_pylist()
     sites = tuple(site.name for site in scene.sites)
     ap = {(row.detector, row.site): row.measures[MEASURE] for row in rows if row.objects_of == ALL_OBJECTS}
     measures = {name: MeasureValues.from_estimates([ap[name, site] for site in sites]) for name in DETECTORS}

@@ -18,8 +18,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.across_junctions import build, candidates, costs, tables, training
+from benchmarks.across_junctions import build, candidates, costs, study_detectors, tables, training
 from benchmarks.across_junctions.measurement import Extent, PartPlan, measure
+from benchmarks.across_junctions.models import figures
 from benchmarks.across_junctions.protocol import (
     CANDIDATES_FILE,
     FOLDER,
@@ -36,8 +37,6 @@ from benchmarks.across_junctions.protocol import (
 )
 from benchmarks.across_junctions.records import NOT_DETECTORS, SCORES, VEHICLES
 from benchmarks.across_junctions.worlds import MissingMapError, make_world
-from benchmarks.detectability import figures
-from benchmarks.validity import low_models
 from egvs.core import files, plugins
 from egvs.core.errors import EgvsError, InputError, MissingBackendError
 from egvs.core.progress import ProgressCallback
@@ -89,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     step = steps.add_parser("list", parents=[data], help="print the protocol and its hash")
     step.add_argument("--freeze", action="store_true", help="write the hashes of score, detectors and statistics")
     step.add_argument("--again", metavar="REASON", help="freeze after a held-out junction was measured; recorded")
+    step.add_argument("--renamed", metavar="OLD=NEW,OLD=NEW", help="frozen modules that were moved or merged; recorded")
     step.set_defaults(step=_list)
 
     step = steps.add_parser("detector", parents=[data], help="train PointPillars (needs PyTorch)")
@@ -181,8 +181,11 @@ def _differences(built: Sequence[build.BuiltJunction]) -> list[str]:
 
 
 def _list(arguments: argparse.Namespace) -> int:
+    if not arguments.freeze and (arguments.again or arguments.renamed):
+        raise InputError("--again, --renamed", "expected --freeze beside them", "Add it.")
     if arguments.freeze:
-        print(write_frozen(arguments.data / "records", again=arguments.again or ""))
+        renamed = dict(_renamed_module(pair) for pair in (arguments.renamed or "").split(",") if pair.strip())
+        print(write_frozen(arguments.data / "records", again=arguments.again or "", renamed=renamed))
     protocol, digests = read_protocol(), ProtocolFiles()
     rule = protocol.candidates
     installed = base.detector_names()
@@ -204,6 +207,12 @@ def _list(arguments: argparse.Namespace) -> int:
         print(f"{digest}  {name}")
     print(f"SHA-256 of the protocol: {digests.digest}")
     return 0
+
+
+def _renamed_module(pair: str) -> tuple[str, str]:
+    """Return the old and the new name of a module."""
+    old, _, new = pair.partition("=")
+    return old.strip(), new.strip()
 
 
 def _detector(arguments: argparse.Namespace) -> int:
@@ -302,7 +311,7 @@ def _world(protocol: Protocol, junction: Junction, arguments: argparse.Namespace
 def _parts(protocol: Protocol, junction: Junction, names: str | None) -> list[str]:
     """Return the requested parts of a junction, or those of the protocol; detectors must be installed."""
     of_protocol = (*NOT_DETECTORS, *protocol.detectors_of(junction))
-    known = (*of_protocol, low_models.SENSOR) if junction.role == "training" else of_protocol
+    known = (*of_protocol, study_detectors.SENSOR) if junction.role == "training" else of_protocol
     parts = list(of_protocol) if names is None else [name.strip() for name in names.split(",") if name.strip()]
     for name in parts:
         if name not in known:
@@ -314,7 +323,7 @@ def _parts(protocol: Protocol, junction: Junction, names: str | None) -> list[st
 
 def _check_detector(name: str) -> None:
     try:
-        low_models.make(name, "--part")
+        study_detectors.make(name, "--part")
     except MissingBackendError as error:
         raise InputError("--part", str(error)) from None
 

@@ -26,12 +26,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.across_junctions.models.comparison import models_for
+from benchmarks.across_junctions.models.figures import Curves
+from benchmarks.across_junctions.models.fitting import curve
 from benchmarks.across_junctions.records import VEHICLES, JunctionRecord
 from benchmarks.across_junctions.statistics import POINTS, standard_errors
 from benchmarks.across_junctions.vehicle_rows import read_rows
-from benchmarks.detectability.comparison import models_for
-from benchmarks.detectability.figures import Curves
-from benchmarks.detectability.fitting import curve
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.extensions.validation.correlation import MeasureValues

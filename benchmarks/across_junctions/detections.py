@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.validity import low_models
+from benchmarks.across_junctions import study_detectors
 from egvs.artefacts.traffic_frames import BOX_COLUMNS, TrafficFrame
 from egvs.clouds import simulation as cloud_simulation
 from egvs.clouds import sweeps
@@ -50,26 +50,26 @@ MEASURES = (
 )  # fmt: skip
 
 COMPUTING = (cloud_simulation.__name__, sweeps.__name__, detection_metrics.__name__, scene_inputs.__name__)
-CALLING = (__name__, low_models.__name__, detector_runs.__name__, held_out_traffic.__name__)
+CALLING = (__name__, study_detectors.__name__, detector_runs.__name__, held_out_traffic.__name__)
 
 Columns = dict[str, Any]
 
 
 def source_digest(detector: str) -> str:
     """Return the digest of the source that a detector's results depend on."""
-    computing = stage_keys.source_digest(*COMPUTING, type(low_models.make(detector)).__module__)
+    computing = stage_keys.source_digest(*COMPUTING, type(study_detectors.make(detector)).__module__)
     calling = {module: stage_keys.text_digest(module) for module in CALLING}
     return files.hash_json([computing.digest, calling])
 
 
 def settings_digest(detector: str) -> str:
     """Return the hash of a detector's settings, or of its model."""
-    return files.hash_json(low_models.make(detector).settings)
+    return files.hash_json(study_detectors.make(detector).settings)
 
 
 def dependencies(held_out: HeldOutTraffic, detector: str = POINT_COUNTS_NAME) -> list[dict[str, Any]]:
     """Return what the results at each candidate depend on, besides the source; without a detector, those of sweeps."""
-    detectors = {} if detector == POINT_COUNTS_NAME else {detector: low_models.make(detector)}
+    detectors = {} if detector == POINT_COUNTS_NAME else {detector: study_detectors.make(detector)}
     task = SiteDetectionTask(held_out, detectors)
     return [task.settings(site, detector) for site in held_out.scene.sites]
 
@@ -113,7 +113,7 @@ def run(
 ) -> DetectorPart:
     """Run a detector at every candidate."""
     costs = _SiteCosts()
-    task = SiteDetectionTask(held_out, {detector: low_models.make(detector)})
+    task = SiteDetectionTask(held_out, {detector: study_detectors.make(detector)})
     results = run_detectors(held_out.scene.sites, task, jobs=jobs, progress=progress, listener=costs)
     frames = list(held_out.read())
     targets = [frame.boxes[frame.target_rows(held_out.scene.roi)] for frame in frames]

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.across_junctions import detections, records
+from benchmarks.across_junctions.candidates import with_sites
+from benchmarks.across_junctions.models.additive_model import DIRECTIONS, target_features
 from benchmarks.across_junctions.protocol import Junction, Protocol
 from benchmarks.across_junctions.records import SCORES, VEHICLES, PartInfo, info_path, write_table
-from benchmarks.detectability.additive_model import DIRECTIONS, target_features
 from benchmarks.records import Machine
-from benchmarks.validity.junctions import check_unseen, with_sites
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
@@ -162,6 +162,21 @@ def _measure(plan: PartPlan, jobs: int | None, progress: ProgressCallback) -> Pa
             site_s = _measure_detector(plan, held_out, jobs, progress)
         reasons = (*(before.again if before else ()), *((plan.again,) if was_measured and plan.again else ()))
         return replace(_info(plan, scenario, held_out, key), skipped=skipped, site_s=round(site_s, 2), again=reasons)
+
+
+def check_unseen(scenario: Scenario) -> None:
+    """Reject traffic that scores and detectors would share.
+
+    Raises
+    ------
+    InputError
+        For traffic that is a finished file.
+    """
+    if scenario.is_recorded:
+        problem = "the traffic is a finished file, so scores and detectors would use the same frames"
+        raise InputError(
+            f"{scenario.file}: traffic.fcd", problem, "Use a network, whose traffic can have another seed."
+        )
 
 
 def source_digest(part: str) -> str:

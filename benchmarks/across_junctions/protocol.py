@@ -5,8 +5,9 @@
 catalogue, so none of them can change unnoticed after it was written down.
 
 ``frozen.json`` has the hashes of what is tested and of how it is judged: the models of the score, the detectors, and
-the statistics and tables. It is written when all choices are made; held-out junctions are only measured while it is
-there and right.
+the statistics and tables. It is written when all choices are made; held-out junctions are only measured while the
+hashes are those of the present source. Whenever it is written again, it records why, and the name and the hash of
+everything that changed, before and after.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ JUNCTIONS_FILE, CANDIDATES_FILE, WORLDS_FILE = "junctions.toml", "candidates.csv
 FROZEN_FILE = "frozen.json"
 
 AGAIN = "frozen again"
-"""Key of the reasons in the file of what is frozen."""
+"""Key of the changes in the file of what is frozen: a reason each, and the names and hashes before and after."""
 
 JUDGING = (
     "benchmarks.across_junctions.statistics",
@@ -51,11 +52,11 @@ JUDGING = (
     "benchmarks.across_junctions.records",
     "benchmarks.across_junctions.detections",
     "benchmarks.across_junctions.measurement",
-    "benchmarks.detectability.additive_model",
-    "benchmarks.detectability.comparison",
-    "benchmarks.detectability.fitting",
-    "benchmarks.validity.pools",
-    "benchmarks.validity.tables",
+    "benchmarks.across_junctions.models.additive_model",
+    "benchmarks.across_junctions.models.comparison",
+    "benchmarks.across_junctions.models.fitting",
+    "benchmarks.across_junctions.egvs_settings",
+    "benchmarks.across_junctions.table_files",
     "egvs.kernels.boosted_trees",
     "egvs.kernels.vehicle_visibility",
     "egvs.scoring.targets",
@@ -369,18 +370,23 @@ def frozen_digests() -> dict[str, str]:
     return digests | {name: stage_keys.text_digest(name) for name in JUDGING}
 
 
-def write_frozen(records_folder: Path, folder: Path = FOLDER, again: str = "") -> Path:
+def write_frozen(
+    records_folder: Path, folder: Path = FOLDER, again: str = "", renamed: Mapping[str, str] | None = None
+) -> Path:
     """Write the file of what is frozen, and return its path.
 
     Parameters
     ----------
     again
-        Why something may be frozen again after a held-out junction was measured; it is recorded.
+        Why something may be frozen again after a held-out junction was measured; it is recorded, with what changed.
+    renamed
+        New name of each module that was moved, or merged into another one, by its name in the file.
 
     Raises
     ------
     InputError
-        If a held-out junction was measured already, and no reason is given.
+        If a held-out junction was measured already or a module was renamed, and no reason is given; for a renamed
+        module whose names are not its former and its present one.
     """
     path = folder / FROZEN_FILE
     held_out = [junction.name for junction in read_protocol().junctions if junction.role == "held out"]
@@ -389,17 +395,43 @@ def write_frozen(records_folder: Path, folder: Path = FOLDER, again: str = "") -
         problem = f"{', '.join(spent)} measured already"
         hint = 'What is frozen after that is hardly frozen. If it must be: --again "REASON", which is recorded.'
         raise InputError(records_folder, problem, hint)
-    reasons = [*frozen_again(folder), *([again] if again else [])]
-    content = frozen_digests() | ({AGAIN: reasons} if reasons else {})
+    if renamed and not again:
+        raise InputError("--renamed", "is recorded with a reason only", 'Give one: --again "REASON".')
+    frozen, changes = _read_frozen(folder)
+    present = frozen_digests()
+    for old, new in (renamed or {}).items():
+        if old not in frozen or old in present or new not in present:
+            problem = f"expected the former and the present name of a frozen module, got {old}={new}"
+            raise InputError("--renamed", problem, "Former names are in frozen.json, present ones in JUDGING.")
+    if again:
+        changes.append({"reason": again, "changed": _changes(frozen, present, renamed or {})})
+    content = present | ({AGAIN: changes} if changes else {})
     files.write_text(path, files.to_json_text(content, indent=1) + "\n")
     return path
 
 
+def _read_frozen(folder: Path) -> tuple[dict[str, str], list[dict[str, Any]]]:
+    """Return the frozen hashes by name, and the changes; both are empty where nothing is frozen."""
+    path = folder / FROZEN_FILE
+    frozen = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    changes = frozen.pop(AGAIN, [])
+    return frozen, changes
+
+
+def _changes(
+    frozen: Mapping[str, str], present: Mapping[str, str], renamed: Mapping[str, str]
+) -> list[dict[str, str | None]]:
+    """Return the name and the hash of everything that changed, before and after; a hash is None where there is none."""
+    new_names = {name: renamed.get(name, name) for name in frozen}
+    new_names |= {name: name for name in present if name not in new_names.values()}
+    rows = [(name, frozen.get(name), new_name, present.get(new_name)) for name, new_name in new_names.items()]
+    keys = ("name", "hash", "new name", "new hash")
+    return [dict(zip(keys, row, strict=True)) for row in rows if row[:2] != row[2:]]
+
+
 def frozen_again(folder: Path = FOLDER) -> list[str]:
     """Return why something was frozen again after a held-out junction was measured."""
-    path = folder / FROZEN_FILE
-    reasons: list[str] = json.loads(path.read_text(encoding="utf-8")).get(AGAIN, []) if path.is_file() else []
-    return reasons
+    return [change["reason"] for change in _read_frozen(folder)[1]]
 
 
 def check_frozen(folder: Path = FOLDER) -> None:
@@ -415,8 +447,7 @@ def check_frozen(folder: Path = FOLDER) -> None:
     hint = f"When all choices are made: {command}, and a line in docs/validity.md."
     if not path.is_file():
         raise InputError(path, "score, detectors and statistics are not frozen yet", hint)
-    frozen, present = json.loads(path.read_text(encoding="utf-8")), frozen_digests()
-    names = (frozen.keys() | present.keys()) - {AGAIN}
-    changed = sorted(name for name in names if frozen.get(name) != present.get(name))
+    frozen, present = _read_frozen(folder)[0], frozen_digests()
+    changed = sorted(name for name in frozen.keys() | present.keys() if frozen.get(name) != present.get(name))
     if changed:
         raise InputError(path, f"{', '.join(changed)} changed since they were frozen", hint)

@@ -4,8 +4,8 @@ The detector PointPillars is trained before, at other junctions and some of thes
 
 Each vehicle-frame of the unseen traffic, as seen from each candidate, is a row: its features, and in how many of the
 two views it was found. Every model is tested on each junction with the models of the others
-(:mod:`benchmarks.detectability.comparison`, where groups are candidates of equal height). Records of other roles are
-never read.
+(:mod:`benchmarks.across_junctions.models.comparison`, where groups are candidates of equal height). Records of other
+roles are never read.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 import sklearn
 
+from benchmarks.across_junctions import study_detectors
 from benchmarks.across_junctions.detections import settings_digest
+from benchmarks.across_junctions.models import comparison, figures, model_file
+from benchmarks.across_junctions.models.comparison import SiteRows
+from benchmarks.across_junctions.models.fitting import Examples, cross_validate, fit_model
 from benchmarks.across_junctions.protocol import Protocol, ProtocolFiles
 from benchmarks.across_junctions.records import info_path, read_junction
 from benchmarks.across_junctions.vehicle_rows import read_rows
-from benchmarks.detectability import comparison, figures, writing
-from benchmarks.detectability.comparison import SiteRows
-from benchmarks.detectability.fitting import Examples, cross_validate, fit_model
-from benchmarks.validity import low_models
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.scoring.target_scores import FEATURES
@@ -100,9 +100,9 @@ def fitted_models(records_folder: Path, protocol: Protocol) -> str:
         As :func:`read_training` and :func:`check_complete`.
     """
     models, settings = {}, {}
-    learnt_on: dict[str, writing.TrainingJunction] = {}
+    learnt_on: dict[str, model_file.TrainingJunction] = {}
     sites: dict[str, dict[str, int]] = {}
-    for detector in (*protocol.detectors.training, low_models.SENSOR):
+    for detector in (*protocol.detectors.training, study_detectors.SENSOR):
         by_junction = read_training(records_folder, protocol, detector)
         check_complete(by_junction, protocol, detector)
         examples = {name: _examples(rows) for name, rows in by_junction.items()}
@@ -111,9 +111,9 @@ def fitted_models(records_folder: Path, protocol: Protocol) -> str:
         for name, rows in by_junction.items():
             sites.setdefault(name, {})[detector] = len(rows)
             sensors = tuple(sorted(set(read_junction(records_folder, name).sensors)))
-            learnt_on[name] = writing.TrainingJunction(sites[name], sensors, len(rows[0].hits))
-    metadata = writing.TrainingMetadata(learnt_on, protocol.training_frames, settings, sklearn.__version__)
-    return writing.text(metadata, models)
+            learnt_on[name] = model_file.TrainingJunction(sites[name], sensors, len(rows[0].hits))
+    metadata = model_file.TrainingMetadata(learnt_on, protocol.training_frames, settings, sklearn.__version__)
+    return model_file.text(metadata, models)
 
 
 def _examples(rows: Sequence[SiteRows]) -> Examples:

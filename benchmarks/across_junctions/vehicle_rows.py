@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.across_junctions.detections import AP
+from benchmarks.across_junctions.models.additive_model import DIRECTIONS, TargetFeatures
+from benchmarks.across_junctions.models.comparison import SiteRows, models_for
 from benchmarks.across_junctions.records import VEHICLES, JunctionRecord, read_table
-from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
-from benchmarks.detectability.comparison import SiteRows, models_for
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.scoring.target_scores import FEATURES, detectability_model

@@ -23,7 +23,6 @@ import tomlkit
 
 from benchmarks.across_junctions import furniture
 from benchmarks.across_junctions.protocol import Junction, MapFile, Protocol, Terrain
-from benchmarks.validity.junctions import SCENARIOS
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.creation import new_scenario
@@ -31,6 +30,8 @@ from egvs.creation.new_scenario import NewScenarioOptions
 from egvs.runs import stage_keys
 from egvs.scenario.loading import load
 from egvs.traffic import sumo, sumo_folder
+
+SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 
 NOTE = "made_from.json"
 BASE, WITH_TABLES = "base", "scenario"

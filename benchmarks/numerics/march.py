@@ -217,18 +217,9 @@ def fragile(o, d, shape, voxel_m, moved_m):
     """Whether moving an end by ``moved_m`` could change a voxel, in float64; see the oracle's ``fragile``."""
     longest = shape.sum() + 8
     times = np.empty(longest)
-    n = 2
-    times[0], times[1] = 0.0, 1.0
+    n = crossing_times(o, d, shape, times)
     length = np.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2) * voxel_m
     grow = moved_m / voxel_m
-    for a in range(3):
-        if d[a] == 0.0:
-            continue
-        for k in range(shape[a] + 1):
-            t = (k - o[a]) / d[a]
-            if 0.0 < t < 1.0:
-                times[n] = t
-                n += 1
     pieces = np.sort(times[:n])
     first, last = np.empty((3, 2), np.int64), np.empty(3, np.int64)
     for i in range(n - 1):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
-from benchmarks.validity import tables as study  # noqa: E402
+from benchmarks.across_junctions import table_files as study  # noqa: E402
 
 STUDY = ROOT / "docs" / "data" / "validity"
 

@@ -25,13 +25,19 @@ from benchmarks.across_junctions import (
     measurement,
     records,
     statistics,
+    study_detectors,
+    table_files,
     tables,
     training,
     vehicle_rows,
     worlds,
 )
+from benchmarks.across_junctions.candidates import with_sites
 from benchmarks.across_junctions.detections import AP, MEASURES
+from benchmarks.across_junctions.models.additive_model import DIRECTIONS
 from benchmarks.across_junctions.protocol import (
+    FOLDER,
+    FROZEN_FILE,
     JUNCTIONS_FILE,
     MIN_SITES_OF_A_HEIGHT,
     Furniture,
@@ -46,13 +52,10 @@ from benchmarks.across_junctions.protocol import (
 )
 from benchmarks.across_junctions.records import VEHICLES, PartInfo, write_table
 from benchmarks.across_junctions.statistics import DetectedJunction, Estimate
-from benchmarks.detectability.additive_model import DIRECTIONS
-from benchmarks.validity import low_models
-from benchmarks.validity import tables as table_files
-from benchmarks.validity.junctions import SCENARIOS, with_sites
+from benchmarks.across_junctions.worlds import SCENARIOS
 
 from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, MissingBackendError
 from egvs.extensions.validation import surrogates
 from egvs.extensions.validation.correlation import MeasureValues
 from egvs.extensions.validation.detectors import cluster
@@ -63,6 +66,7 @@ from egvs.scenario.loading import load
 from egvs.scoring.target_scores import DETECTORS, FEATURES, MODELLED, DetectabilityModel, detectability_model
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site
+from egvs.stages.inputs import build_scene
 from egvs.traffic import sumo_folder
 from egvs.world.carriageway import Carriageway
 from tests.conftest import write_mini
@@ -121,6 +125,19 @@ def test_the_results_of_each_junction_are_those_of_the_tables() -> None:
     assert all(cells == ["", "", ""] for cells in shown.values())  # not measured
 
 
+def test_page_has_the_rho_of_each_gamma_and_voxel_size() -> None:
+    page = (DOCS / "validity.md").read_text(encoding="utf-8").partition("\n### EGVS by gamma and voxel size\n")[2]
+    (table,) = (each for each in table_files.read(DOCS / "data" / "larger_study")[1] if each.name == "13 settings")
+    expected: dict[str, list[str]] = {}
+    for role, detector, voxel_m, occlusion, _, junctions, rho, within in table.rows:
+        if (role, detector) == ("held out", "cluster"):
+            head = f"| {voxel_m:g} | {occlusion} | {junctions} |"
+            expected.setdefault(head, []).append(f" {rho[0]:.2f}, {within[0]:.2f} |")
+    assert len(expected) == 6
+    for head, cells in expected.items():
+        assert f"\n{head}{''.join(cells)}\n" in page.partition("\n### ")[0]
+
+
 def test_every_junction_has_its_candidates_and_its_scenario() -> None:
     protocol, drawn = read_protocol(), candidates.read_candidates()
     assert list(drawn) == [junction.name for junction in protocol.measured_junctions]
@@ -142,6 +159,57 @@ def test_every_junction_has_its_candidates_and_its_scenario() -> None:
 def test_candidates_stand_at_their_height_where_the_ground_is_flat() -> None:
     for site, height_m in candidates.read_candidates()["grid_left"].items():
         assert site.pose.z_m == height_m
+
+
+def test_no_pole_is_in_the_building_or_outside_the_surroundings(mini: Path) -> None:
+    free = candidates.free_locations(build_scene(load(mini)), None, (2.0, 4.0))
+    x, y = free.T
+    assert not ((x > 14) & (x < 18) & (y > 5) & (y < 8)).any()
+    assert x.min() == -12.0 and x.max() == 52.0 and y.min() == -22.0 and y.max() == 22.0
+
+
+def test_poles_are_next_to_lanes() -> None:
+    scenario = load(SCENARIOS / "hill")
+    roads = sumo_folder.read_network(scenario)
+    assert roads is not None
+    lanes = Carriageway.of(roads)
+    free = candidates.free_locations(build_scene(scenario), lanes, (2.0,))
+    away_m = shapely.distance(shapely.union_all(lanes.areas), shapely.points(free))
+    assert len(free) > 100 and away_m.min() > 0.0 and away_m.max() <= candidates.ROAD_M
+
+
+def test_scenario_with_sites_has_no_keys_of_its_former_sites(mini: Path, tmp_path: Path) -> None:
+    scenario = load(mini, ["sites.yaw_deg=30"])
+    expected = [Site("a", Pose(1.0, -7.0, 3.0, 5.0, -2.0, 1.0), "small"), Site("b", Pose(8.0, 7.0, 4.0), "VLP-16")]
+    sites = build_scene(with_sites(scenario, expected, tmp_path / "sites.csv")).sites
+    assert [(site.name, site.pose, site.sensor) for site in sites] == [
+        (site.name, site.pose, site.sensor) for site in expected
+    ]
+
+
+def test_rejects_traffic_that_scores_would_share(mini: Path) -> None:
+    with pytest.raises(InputError, match=r"traffic\.fcd: the traffic is a finished file"):
+        measurement.check_unseen(load(mini))
+    measurement.check_unseen(load(SCENARIOS / "hill"))
+
+
+def test_models_of_the_study_were_not_trained_at_junctions_of_a_result() -> None:
+    shipped = ["ingolstadt", "hill", "roundabout"]
+    detector_roles = [f"detector_{name}" for name in ("grid", "queue", "left", "slope", "people")]
+    for model, convention, heights_m, trained_at in (
+        (SHIPPED_MODEL, "ground", [2.0, 8.0], [*shipped, *detector_roles]),
+        (study_detectors.model_file(study_detectors.LOW), "ground", [2.0, 2.0], [*shipped, "east"]),
+        (study_detectors.model_file(study_detectors.SENSOR), "sensor", [2.0, 2.0], [*shipped, "east"]),
+    ):
+        metadata = OnnxModel.load(model).metadata
+        assert metadata["convention"] == convention and metadata["recipe"]["heights_m"] == heights_m
+        assert metadata["junctions"] == trained_at
+
+
+def test_rejects_missing_model(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(study_detectors, "model_file", lambda name: tmp_path / f"{name}.onnx")
+    with pytest.raises(MissingBackendError, match=r"there is no file pointpillars_2m\.onnx"):
+        study_detectors.make(study_detectors.LOW)
 
 
 @pytest.mark.parametrize(
@@ -512,6 +580,11 @@ def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
     assert ("training", "height") not in less  # there is no other training junction to fit it to
     everything = {(row[0], row[2]): row[4] for row in by_name["7 all scores"].rows}
     assert everything["training", "less_is_better"] == -1.0
+    settings = [row[2:6] for row in by_name["13 settings"].rows if row[0] == "held out"]
+    assert settings == [[0.25, "no", "2", 1], [0.25, "no", "10", 1]]  # those of the records
+    rhos = {(row[0], row[4]): [rho[0] for rho in row[6:]] for row in by_name["13 settings"].rows}
+    assert rhos["held out", "2"] == [rho[0] for rho in rows_of["h", tables.EGVS_2][5:7]]
+    assert rhos["training", "10"] == [1.0, 1.0]
 
 
 def test_aims_are_decided_when_all_held_out_junctions_are_there(made_up: Path, tmp_path: Path) -> None:
@@ -686,7 +759,7 @@ def write_rows(
 def test_models_are_fitted_to_training_records(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, detectors = tmp_path / "records", (*read_protocol().detectors.training, low_models.SENSOR)
+    folder, detectors = tmp_path / "records", (*read_protocol().detectors.training, study_detectors.SENSOR)
     folder.mkdir()
     rng = np.random.default_rng(11)
     for name in ("hill", "xian", "town01"):  # the last is held out
@@ -819,6 +892,57 @@ def test_held_out_junctions_need_what_is_tested_to_be_frozen(tmp_path: Path) -> 
     check_frozen(tmp_path)
     write_frozen(tmp_path / "records", tmp_path, again="another one")
     assert frozen_again(tmp_path) == ["a fault in the cable", "another one"]
+    first, second = json.loads(path.read_text(encoding="utf-8"))["frozen again"]
+    changed = {row["name"]: (row["hash"], row["new name"], row["new hash"]) for row in first["changed"]}
+    assert changed == {name: ("another", name, frozen[name]) for name in ("score", "cluster")}
+    assert second["changed"] == []
+
+
+def test_moved_modules_are_recorded_with_both_names(tmp_path: Path) -> None:
+    path = write_frozen(tmp_path / "records", tmp_path)
+    present = json.loads(path.read_text(encoding="utf-8"))
+    tables_name, records_name = "benchmarks.across_junctions.tables", "benchmarks.across_junctions.records"
+    former = {name: digest for name, digest in present.items() if name not in (tables_name, records_name)}
+    former |= {"benchmarks.former": present[tables_name], "benchmarks.dropped": "1"}
+    path.write_text(json.dumps(former), encoding="utf-8")
+    for wrong in (
+        {"benchmarks.unknown": tables_name},
+        {"benchmarks.former": "benchmarks.unknown"},
+        {"score": "cluster"},
+    ):
+        with pytest.raises(InputError, match="expected the former and the present name of a frozen module"):
+            write_frozen(tmp_path / "records", tmp_path, again="moved", renamed=wrong)
+    with pytest.raises(InputError, match="is recorded with a reason only"):
+        write_frozen(tmp_path / "records", tmp_path, renamed={"benchmarks.former": tables_name})
+    write_frozen(tmp_path / "records", tmp_path, again="moved", renamed={"benchmarks.former": tables_name})
+    check_frozen(tmp_path)
+    ((entry,), digest) = json.loads(path.read_text(encoding="utf-8"))["frozen again"], present[tables_name]
+    assert [list(row.values()) for row in entry["changed"]] == [
+        ["benchmarks.former", digest, tables_name, digest],
+        ["benchmarks.dropped", "1", "benchmarks.dropped", None],
+        [records_name, None, records_name, present[records_name]],
+    ]
+
+
+def test_each_recorded_change_starts_where_the_one_before_ended() -> None:
+    hashes = json.loads((FOLDER / FROZEN_FILE).read_text(encoding="utf-8"))
+    changes = hashes.pop("frozen again")
+    assert all(change["changed"] for change in changes)
+    for change in reversed(changes):
+        for row in change["changed"]:
+            assert hashes.get(row["new name"]) == row["new hash"]
+        for row in change["changed"]:
+            hashes.pop(row["new name"], None)
+        hashes |= {row["name"]: row["hash"] for row in change["changed"] if row["hash"]}
+    # of commit 7996a952, which froze the modules first
+    assert hashes["benchmarks.across_junctions.tables"].startswith("2b4022f6")
+    assert hashes["score"].startswith("d277d0d0")
+
+
+def test_list_records_changes_only_when_it_freezes(capsys: pytest.CaptureFixture[str]) -> None:
+    for option in (["--again", "moved"], ["--renamed", "a=b"]):
+        assert command.main(["list", *option]) == 2
+        assert "--again, --renamed: expected --freeze beside them" in capsys.readouterr().err
 
 
 def test_list_prints_the_hash(capsys: pytest.CaptureFixture[str]) -> None:

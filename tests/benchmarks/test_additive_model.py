@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from benchmarks.detectability.additive_model import (
+from benchmarks.across_junctions.models.additive_model import (
     DIRECTIONS,
     AdditiveModel,
     TargetFeatures,
     target_features,
 )
-from benchmarks.detectability.crowding import CLASSES
+from benchmarks.across_junctions.models.crowding import CLASSES
 
 from egvs.scoring.target_scores import point_spacing_m
 from tests.scoring.target_scenes import frame, seen

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 import shapely
-from benchmarks.detectability import crowding
-from benchmarks.detectability.crowding import MAX_BESIDE_DEG, MAX_LINK_GAP, NEIGHBOUR_M, measure_crowding
-from benchmarks.detectability.crowding_kernels import RAY_SHARES
+from benchmarks.across_junctions.models import crowding
+from benchmarks.across_junctions.models.crowding import MAX_BESIDE_DEG, MAX_LINK_GAP, NEIGHBOUR_M, measure_crowding
+from benchmarks.across_junctions.models.crowding_kernels import RAY_SHARES
 from shapely import affinity
 
 from egvs.artefacts.traffic_frames import TrafficFrame

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.across_junctions.detections import hits_of
-from benchmarks.detectability import figures, fitting, writing
-from benchmarks.detectability.fitting import Examples
+from benchmarks.across_junctions.models import figures, fitting, model_file
+from benchmarks.across_junctions.models.fitting import Examples
 
 from egvs.scoring import target_scores
 from egvs.scoring.target_scores import FEATURES, MODELLED, DetectabilityModel
@@ -139,19 +139,19 @@ def test_thresholds_are_not_rounded_below_a_value_of_the_data() -> None:
 # the file
 
 
-def about_of(shipped: dict) -> writing.TrainingMetadata:
+def about_of(shipped: dict) -> model_file.TrainingMetadata:
     its = shipped["about"]
     on = {
-        n: writing.TrainingJunction(j["sites"], tuple(j["sensors"]), j["vehicle_frames"])
+        n: model_file.TrainingJunction(j["sites"], tuple(j["sensors"]), j["vehicle_frames"])
         for n, j in its["learnt_on"].items()
     }
-    return writing.TrainingMetadata(on, its["frames"], its["settings"], its["scikit_learn"])
+    return model_file.TrainingMetadata(on, its["frames"], its["settings"], its["scikit_learn"])
 
 
 def test_the_shipped_file_is_as_it_would_be_written_again() -> None:
     text = target_scores.MODEL_FILE.read_text(encoding="utf-8")
     shipped = json.loads(text)
-    assert writing.text(about_of(shipped), shipped["detectors"]) == text
+    assert model_file.text(about_of(shipped), shipped["detectors"]) == text
     for name, its in shipped["detectors"].items():
         counts = {n: j["sites"][name] * j["vehicle_frames"] for n, j in shipped["about"]["learnt_on"].items()}
         seen = sum(part["vehicle_frames"] for part in its["elsewhere"]["calibration"])  # those with points
@@ -159,12 +159,12 @@ def test_the_shipped_file_is_as_it_would_be_written_again() -> None:
 
 
 def test_the_shipped_models_are_of_the_detectors_that_are_shipped() -> None:
-    from benchmarks.validity import low_models
+    from benchmarks.across_junctions import study_detectors
 
     from egvs.core import files
 
     shipped = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))["about"]["settings"]
-    assert shipped == {name: files.hash_json(low_models.make(name).settings) for name in MODELLED}
+    assert shipped == {name: files.hash_json(study_detectors.make(name).settings) for name in MODELLED}
 
 
 def test_the_picture_shows_every_part_of_the_curves(tmp_path: Path) -> None:

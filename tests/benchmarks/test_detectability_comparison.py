@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.across_junctions.models import additive_fitting, comparison, figures, fitting
+from benchmarks.across_junctions.models.additive_fitting import TrainingRows, choose_knots, fit_additive, ramps
+from benchmarks.across_junctions.models.additive_model import DIRECTIONS, TargetFeatures
+from benchmarks.across_junctions.models.comparison import ModelForm, SiteRows
 from benchmarks.across_junctions.protocol import read_protocol
-from benchmarks.detectability import additive_fitting, comparison, figures, fitting
-from benchmarks.detectability.additive_fitting import TrainingRows, choose_knots, fit_additive, ramps
-from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
-from benchmarks.detectability.comparison import ModelForm, SiteRows
 
 from egvs.core.errors import EgvsError
 

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
-from benchmarks.detectability import figures, fitting
-from benchmarks.detectability.additive_fitting import TrainingRows, fit_additive
-from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
-from benchmarks.detectability.fitting import curve, equal_weights, fit_trees
+from benchmarks.across_junctions.models import figures, fitting
+from benchmarks.across_junctions.models.additive_fitting import TrainingRows, fit_additive
+from benchmarks.across_junctions.models.additive_model import DIRECTIONS, TargetFeatures
+from benchmarks.across_junctions.models.fitting import curve, equal_weights, fit_trees
 from egvs.scoring import target_scores
 from egvs.scoring.target_scores import FEATURES, DetectabilityModel
 

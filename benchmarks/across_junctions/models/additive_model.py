@@ -1,7 +1,7 @@
 r"""Candidates for a later version of ``expected_detections``: more features, and an additive model of them.
 
-The features include how crowded a vehicle is as seen from the sensor (:mod:`benchmarks.detectability.crowding`). The
-model of the probability that a detector finds the vehicle is
+The features include how crowded a vehicle is as seen from the sensor
+(:mod:`benchmarks.across_junctions.models.crowding`). The model of the probability that a detector finds the vehicle is
 
 .. math:: p(x) = \frac{1}{1 + e^{-b - \sum_k f_k(x_k) - c}}
 
@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.detectability.crowding import measure_crowding, vehicle_classes
+from benchmarks.across_junctions.models.crowding import measure_crowding, vehicle_classes
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
 from egvs.scoring.target_scores import ISOLATED_GAP_M, MONOTONICITY, point_spacing_m
@@ -51,7 +51,7 @@ class TargetFeatures:
     columns
         (n,) float64 each, by the names of :data:`DIRECTIONS`.
     vehicle_class
-        Index in :data:`benchmarks.detectability.crowding.CLASSES`, -1 for people, (n,) int64.
+        Index in :data:`benchmarks.across_junctions.models.crowding.CLASSES`, -1 for people, (n,) int64.
     """
 
     columns: Mapping[str, FloatArray]
@@ -104,7 +104,7 @@ class AdditiveModel:
     curves
         Knots, ascending, and the values of :math:`f_k` there, (m,) float64 each, by feature.
     class_offsets
-        c of each of :data:`benchmarks.detectability.crowding.CLASSES`, (5,) float64.
+        c of each of :data:`benchmarks.across_junctions.models.crowding.CLASSES`, (5,) float64.
     """
 
     intercept: float

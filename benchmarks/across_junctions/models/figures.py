@@ -14,10 +14,8 @@ from egvs.core import files
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-NAME = "detectability.png"
-
 Curves = Mapping[str, Sequence[Mapping[str, float]]]
-"""By junction, the bins of :func:`benchmarks.detectability.fitting.curve`."""
+"""By junction, the bins of :func:`benchmarks.across_junctions.models.fitting.curve`."""
 
 OTHERS = "each junction predicted by the model of the others"
 

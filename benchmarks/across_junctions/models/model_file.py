@@ -67,8 +67,8 @@ def text(metadata: TrainingMetadata, models: Mapping[str, Mapping[str, Any]]) ->
     Parameters
     ----------
     models
-        By detector: ``base`` and ``trees`` of :func:`benchmarks.detectability.fitting.fit_model`, and ``elsewhere`` of
-        :func:`benchmarks.detectability.fitting.cross_validate`.
+        By detector: ``base`` and ``trees`` of :func:`benchmarks.across_junctions.models.fitting.fit_model`, and
+        ``elsewhere`` of :func:`benchmarks.across_junctions.models.fitting.cross_validate`.
     """
     head = json.dumps(metadata.to_json(), indent=1).replace("\n", "\n ")
     each = ",\n".join(f'  "{name}": {_model(model)}' for name, model in models.items())

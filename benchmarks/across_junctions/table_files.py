@@ -57,23 +57,14 @@ class Table:
     columns: list[Column]
     rows: list[list[Cell]]
 
-    def column(self, heading: str) -> list[Any]:
-        """The cells of a column."""
-        column_index = [column.heading for column in self.columns].index(heading)
-        return [row[column_index] for row in self.rows]
-
 
 def with_interval(value: float, interval: ConfidenceInterval) -> Cell:
     """A number with its interval of 95 %."""
-    return None if math.isnan(value) else [_rounded(value), _rounded(interval.low), _rounded(interval.high)]
+    return None if math.isnan(value) else [number(value), number(interval.low), number(interval.high)]
 
 
-def number(value: float) -> Cell:
-    """A number."""
-    return _rounded(value)
-
-
-def _rounded(value: float) -> float | None:
+def number(value: float) -> float | None:
+    """A number as it is saved; None if undefined."""
     return None if math.isnan(value) else round(float(value), SAVED_DIGITS) + 0.0
 
 

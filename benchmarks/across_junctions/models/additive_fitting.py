@@ -1,4 +1,4 @@
-r"""Fit :class:`benchmarks.detectability.additive_model.AdditiveModel`, with the prescribed directions as bounds.
+r"""Fit an additive model (:mod:`benchmarks.across_junctions.models.additive_model`), with directions as bounds.
 
 Each feature becomes ramps between neighbouring knots (quantiles of the training data), from 0 to 1. A piecewise linear
 function is a sum of ramps; it rises if no coefficient is negative. The coefficients minimise the weighted mean of the
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from benchmarks.detectability.additive_model import DIRECTIONS, AdditiveModel, TargetFeatures
-from benchmarks.detectability.crowding import CLASSES
+from benchmarks.across_junctions.models.additive_model import DIRECTIONS, AdditiveModel, TargetFeatures
+from benchmarks.across_junctions.models.crowding import CLASSES
 from egvs.core.errors import EgvsError
 from egvs.core.special import expit
 
@@ -73,8 +73,8 @@ def fit_additive(rows: Sequence[TrainingRows], names: Sequence[str], with_classe
     rows
         One for each junction.
     names
-        Features to use, of :data:`benchmarks.detectability.additive_model.DIRECTIONS`. A feature that is the same
-        everywhere is left out.
+        Features to use, of :data:`benchmarks.across_junctions.models.additive_model.DIRECTIONS`. A feature that is the
+        same everywhere is left out.
     with_classes
         Whether classes have offsets; the mean offset is 0 by the ridge.
 

@@ -1,4 +1,4 @@
-"""Kernels of :mod:`benchmarks.detectability.crowding`: gaps between vehicles as seen from a sensor, in plan view.
+"""Kernels of the module ``crowding``: gaps between vehicles as seen from a sensor, in plan view.
 
 Rectangles are rows of :func:`egvs.kernels.vehicle_visibility.footprints`: centre x, y, cosine and sine of the yaw, half
 length, half width; metres and the grid's frame. A rectangle spans azimuths from its middle minus to its middle plus a
