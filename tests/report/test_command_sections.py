@@ -15,7 +15,7 @@ from egvs.artefacts.command_results import CommandResult, read_results, write_re
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.run_folder import COMMAND_RESULTS, RunFolder
 from egvs.core.errors import InputError
-from egvs.report.command_sections import DIGEST_KEY, design_digest, what_if_digest
+from egvs.results.command_entries import DIGEST_KEY, design_digest, what_if_digest
 from egvs.scenario.model import Scenario
 from tests.report.small_runs import render_report, run_to_scores
 

@@ -7,7 +7,7 @@ from typing import get_args
 
 import pytest
 
-from egvs.results.labels import SCORE_LABELS, format_probability, keep_percentages_together
+from egvs.results.labels import SCORE_LABELS, format_probability
 from egvs.scenario.score_config import OtherScore
 
 
@@ -67,13 +67,3 @@ def test_small_standard_error_is_not_written_as_zero() -> None:
 )
 def test_probabilities_are_whole_per_cent_that_keep_their_side_of_the_limit(probability: float, text: str) -> None:
     assert format_probability(probability) == text
-
-
-def test_no_line_of_a_page_begins_with_a_percent_sign() -> None:
-    page = (
-        '<style>a { width: 5 %; }</style><p title="4 %">93 % of <b>7.5 %</b>, 5 % 3</p><script>x = 7 % 2</script> 1 %'
-    )
-    assert keep_percentages_together(page) == (
-        '<style>a { width: 5 %; }</style><p title="4 %">93\u00a0% of <b>7.5\u00a0%</b>, 5\u00a0% 3</p>'
-        "<script>x = 7 % 2</script> 1 %"
-    )

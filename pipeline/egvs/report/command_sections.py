@@ -1,8 +1,7 @@
 """Sections of the page on what-ifs, installation sheets, acceptance checks and sensor design.
 
-An entry of a file of results (:mod:`egvs.artefacts.command_results`) is shown while it belongs to the run: the stages
-that it depends on have the same inputs, and its digest of further settings (:data:`DIGEST_KEY`) is the present one. A
-site must still have the pose of the sheet, or the planned one of the acceptance check.
+An entry is shown while it belongs to the run (:mod:`egvs.results.command_entries`). A site must still have the pose of
+the sheet, or the planned one of the acceptance check.
 """
 
 from __future__ import annotations
@@ -12,86 +11,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from egvs.artefacts.command_results import read_results
-from egvs.artefacts.run_folder import COMMAND_RESULTS, RunFile, RunFolder
-from egvs.artefacts.run_record import StageRecord
-from egvs.core import files
-from egvs.core.errors import InputError
+from egvs.artefacts.run_folder import RunFile, RunFolder
 from egvs.core.wording import format_percent
+from egvs.results.command_entries import Entries
 from egvs.results.labels import SCORE_LABELS, format_probability
 from egvs.results.ranking import RankedSite
 from egvs.results.sensors import ScoreDifference, difference_unit, format_difference
-from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.sensors.sites import Pose
-from egvs.stages.base import StageContext
-
-DIGEST_KEY = "digest"
-"""Key of an entry with a hash of settings that no stage depends on."""
 
 _POSE_TOLERANCE = 1e-6
-
-Entries = Mapping[str, Mapping[str, Any]]
-"""Values of the entries of a file, by name."""
-
-
-def what_if_digest(scenario: Scenario, tables: Iterable[str]) -> str | None:
-    """Return a hash of some tables ``[what_if.NAME]`` and their files; None where one does not exist."""
-    values = []
-    for name in tables:
-        if name not in scenario.what_if:
-            return None
-        table = scenario.what_if[name]
-        named = [*table.footprints, *([table.vehicles] if table.vehicles else [])]
-        try:
-            digests = [files.hash_file(scenario.find(file, f"what_if.{name}")) for file in named]
-        except InputError:  # a file was removed since
-            return None
-        values.append([name, table.model_dump(mode="json"), digests])
-    return files.hash_json(values)
-
-
-def design_digest(scenario: Scenario) -> str:
-    """Return a hash of the settings of sensors, scores and effects, on which the design of a sensor depends."""
-    sensors = {name: sensor.model_dump(mode="json") for name, sensor in scenario.sensors.items()}
-    parts = [sensors, scenario.score.model_dump(mode="json"), scenario.effects.model_dump(mode="json")]
-    return files.hash_json(parts)
-
-
-def current_entries(work: StageContext, stages: Mapping[str, StageRecord]) -> dict[str, dict[str, Mapping[str, Any]]]:
-    """Return the entries that belong to a run, by file and name; files without one are left out.
-
-    Parameters
-    ----------
-    work
-        The run.
-    stages
-        Its recorded stages.
-    """
-    scenario, current = work.scenario, {}
-    for file in COMMAND_RESULTS:
-        entries = {}
-        for name, result in read_results(work.path(file.name)).items():
-            if not result.is_current(stages):
-                continue
-            digest = None
-            if file is RunFolder.what_if:
-                digest = what_if_digest(scenario, result.values["tables"])
-            elif file is RunFolder.sensor_design:
-                digest = design_digest(scenario)
-            if digest == result.values.get(DIGEST_KEY):
-                entries[name] = result.values
-        if entries:
-            current[file.name] = entries
-    return current
-
-
-def pose_json(pose: Pose) -> dict[str, float]:
-    """Return a pose as JSON values."""
-    return asdict(pose)
-
-
-# ---- what the template shows
 
 
 @dataclass(frozen=True)
@@ -170,27 +99,20 @@ class CommandSections:
     designs: tuple[DesignTable, ...] = ()
 
     @classmethod
-    def read(
-        cls,
-        work: StageContext,
-        stages: Mapping[str, StageRecord],
-        sites: Iterable[RankedSite],
-        plan: Mapping[str, Pose],
+    def of(
+        cls, current: Mapping[str, Entries], sites: Iterable[RankedSite], plan: Mapping[str, Pose]
     ) -> CommandSections:
-        """Read the results in a run folder.
+        """Return the results of a run in words.
 
         Parameters
         ----------
-        work
-            The run.
-        stages
-            Its recorded stages.
+        current
+            The entries that belong to the run, by file and name.
         sites
             The ranked sites, at least one.
         plan
             Poses of the sensors of the plan, by site.
         """
-        current = current_entries(work, stages)
         ranked = tuple(sites)
         poses = {
             site.site: Pose(site.x_m, site.y_m, site.z_m, site.yaw_deg, site.pitch_deg, site.roll_deg)

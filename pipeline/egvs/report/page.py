@@ -16,22 +16,19 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egvs._version import __version__
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, MIN_VEHICLES, PeriodRanking
 from egvs.artefacts.run_folder import ACCURACY_FILES, COMMAND_RESULTS, PLACEMENT_FILES, VALIDATION_FILES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord, traffic_summary
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, collect_warnings
-from egvs.core.wording import format_percent
-from egvs.drawing import maps
+from egvs.drawing import maps, pages
 from egvs.drawing import run_figures as figures
 from egvs.drawing.basemap import network_file
-from egvs.drawing.colours import STYLE_SHEET
 from egvs.drawing.run_figures import Figures
 from egvs.report.approach_fits import ApproachFit, compare_approaches
 from egvs.report.approach_map import busiest_counts, draw_approach_map
-from egvs.report.command_sections import CommandSections, current_entries
+from egvs.report.command_sections import CommandSections
 from egvs.report.points_section import MAPPED_POLES, PointsSection
 from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
@@ -49,6 +46,7 @@ from egvs.report.sections import (
 from egvs.report.signal_diagram import signal_diagrams
 from egvs.report.zone_section import ZoneSection
 from egvs.results import labels as formatting
+from egvs.results.command_entries import current_entries
 from egvs.results.map_credits import read_map_credits
 from egvs.results.ranking import (
     RankedSite,
@@ -173,7 +171,7 @@ def dependencies(work: StageContext) -> StageDependencies:
         settings["counts"] = describe_counts(scenario, network_file(work.folder.path))
     if map_credits := read_map_credits(scenario):
         settings["map_credits"] = map_credits
-    if current := current_entries(work, stages):
+    if current := current_entries(work.folder, scenario, stages):
         settings["command_results"] = {name: list(entries) for name, entries in current.items()}
     hashes: dict[str, str] = {}
     if scenario.scan.keep:
@@ -259,7 +257,11 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
         plan=plan,
-        commands=CommandSections.read(work, stages, ranking.sites, {mount.name: mount.pose for mount in mounts}),
+        commands=CommandSections.of(
+            current_entries(work.folder, work.scenario, stages),
+            ranking.sites,
+            {mount.name: mount.pose for mount in mounts},
+        ),
         movements=describe_counts(work.scenario, network_file(out)),
         zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
         points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
@@ -290,44 +292,21 @@ def render_page(contents: PageContents) -> str:
         **_sentences(contents),
         **_warning_values(contents),
     }
-    return formatting.keep_percentages_together(_template_environment().get_template("report.html.j2").render(values))
+    return pages.render(_template_environment(), "report.html.j2", **values)
 
 
 def prepare() -> None:
     """Load the templates, and the library that fills them."""
     environment = _template_environment()
-    for path in TEMPLATES.glob("*.html.j2"):
-        environment.get_template(path.name)
+    for name in environment.list_templates(["j2"]):
+        environment.get_template(name)
 
 
 @cache
 def _template_environment() -> Environment:
-    """Templates and filters; jinja2 is imported only when a page is written."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
-
-    from egvs.drawing.template_cache import open_template_cache
-
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        bytecode_cache=open_template_cache(Path(__file__)),
-    )
-    environment.filters |= {
-        "svg": Markup,
-        "share": format_percent,
-        "probability": formatting.format_probability,
-        "whole": formatting.format_count,
-        "plain": formatting.format_number,
-        "degrees": formatting.format_degrees,
-    }
+    environment = pages.page_environment(TEMPLATES)
     environment.globals |= {
-        "style": Markup(STYLE_SHEET),
-        "choose": Markup((TEMPLATES / "choose.js").read_text(encoding="utf-8")),
-        "version": __version__,
+        "choose": (TEMPLATES / "choose.js").read_text(encoding="utf-8"),
         "separable": DISTINCT_PROBABILITY,
         "min_vehicles": MIN_VEHICLES,
     }
@@ -437,5 +416,6 @@ STAGE = Stage(
         RunFolder.zones,
     ),
     effect_stages=("scan", "score"),
+    is_view=True,
     prepare=(prepare,),
 )

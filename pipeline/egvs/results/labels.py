@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -210,27 +209,6 @@ def format_probability(probability: float) -> str:
     if percent >= limit and probability < DISTINCT_PROBABILITY:
         percent = limit - 1
     return f"{percent} %"
-
-
-_NOT_TEXT = re.compile(r"(<(script|style)\b.*?</\2>)", re.DOTALL)
-_TEXT = re.compile(r">[^<>]+")
-_SPACE_BEFORE_SIGN = re.compile(r"(?<=\d) (?=%)")
-
-
-def keep_percentages_together(html: str) -> str:
-    """Return a page on which no line begins with the sign of a percentage: its space does not break.
-
-    Attributes, scripts and style sheets stay as they are.
-
-    >>> keep_percentages_together('<p title="5 %">5 %</p>').replace("\\u00a0", "_")
-    '<p title="5 %">5_%</p>'
-    """
-    parts = _NOT_TEXT.split(html)
-    for number in range(0, len(parts), 3):  # text, then the two groups of a script or style sheet
-        parts[number] = _TEXT.sub(lambda match: _SPACE_BEFORE_SIGN.sub("\u00a0", match[0]), parts[number])
-        if number + 2 < len(parts):
-            parts[number + 2] = ""
-    return "".join(parts)
 
 
 def format_count(value: float) -> str:

@@ -10,6 +10,7 @@ from egvs.artefacts.command_results import CommandResult, write_results
 from egvs.artefacts.run_folder import RunFile, RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.runs.run import lock_run_folder, refresh_report
+from egvs.runs.stage_registry import stage
 
 LOCK_WAIT_S = 60.0
 """How long to wait for another command in the folder."""
@@ -45,7 +46,7 @@ def add_to_report(
     """
     with lock_run_folder(folder, LOCK_WAIT_S):
         recorded = RunRecord.read(folder).stages
-        names = [name for name in recorded if name != "report"] if stages is None else list(stages)
+        names = [name for name in recorded if not stage(name).is_view] if stages is None else list(stages)
         inputs = {name: recorded[name].inputs for name in names}
         path = folder / file.name
         write_results(path, {name: CommandResult(inputs, entry) for name, entry in values.items()})

@@ -119,7 +119,7 @@ def run(
         with run_in_background("traffic", key, context, current.store) as current.background, current.compiler:
             for number, stage in enumerate(stages, 1):
                 current.ensure_stage(stage, (options or {}).get(stage, {}), next_stages=stages[number:])
-            return current.finish(keep=(*only, "report"))
+            return current.finish(keep=only, keep_views=True)
 
 
 def run_one(
@@ -189,19 +189,21 @@ def refresh_report(out: Path) -> Path | None:
         return None
     record = RunRecord.read(out)
     source = Path(os.path.normpath(out / record.scenario_folder))
-    if not source.is_dir() or not all(stage in record.stages for stage in STAGE_NAMES if stage != "report"):
+    views = [name for name in STAGE_NAMES if stage_registry.stage(name).is_view]
+    inputs = [name for name in STAGE_NAMES if name not in views]
+    if not source.is_dir() or not all(stage in record.stages for stage in inputs):
         return None
-    if "report" not in record.stages and not folder.report.is_file():
+    if not folder.report.is_file() and not any(view in record.stages for view in views):
         return None
 
     scenario = scenario_from_dict(record.scenario, source, str(folder.run_record))
     context = open_folder(scenario, out)
-    inputs = [stage for stage in record.stages if stage != "report"]
     for stage in inputs:
         if not _is_up_to_date(stage, context, record) or not _is_intact(context, record.stages[stage]):
             return None
     current = _Run(context, record, complete=set(inputs))
-    current.ensure_stage("report", {})
+    for view in views:
+        current.ensure_stage(view, {})
     current.finish(keep=STAGE_NAMES)
     return folder.report
 
@@ -405,12 +407,15 @@ class _Run:
             complete = {name: stage for name, stage in self.record.stages.items() if name in self.complete}
             replace(self.record, stages=complete).write(self.context.folder.path)
 
-    def finish(self, keep: Collection[str]) -> RunRecord:
-        """Write ``run.json`` if it changed; drop stages of other settings, except those in ``keep``."""
+    def finish(self, keep: Collection[str], *, keep_views: bool = False) -> RunRecord:
+        """Write ``run.json`` if it changed; drop stages of other settings, except those in ``keep``, and views."""
         for stage in list(self.record.stages):
-            if stage == "report" and stage not in keep:
-                self._write(self.record.having(stage, None))  # the key of the report depends on this record
-            if stage not in keep and not _is_up_to_date(stage, self.context, self.record):
+            is_view = stage_registry.stage(stage).is_view
+            if stage in keep or (is_view and keep_views):
+                continue
+            if is_view:
+                self._write(self.record.having(stage, None))  # the key of a view depends on this record
+            if not _is_up_to_date(stage, self.context, self.record):
                 self.record = self.record.having(stage, None)
         self._write(self.record)
         os.utime(self.context.folder.lock)  # "egvs runs" shows when a run was last at work

@@ -25,6 +25,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.run_record import StageRecord
 from egvs.core import files
 from egvs.effects import registry
+from egvs.runs import stage_registry
 from egvs.runs.stage_registry import StageResult, stage
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies
@@ -109,6 +110,8 @@ def source_modules(*modules: str) -> dict[str, tuple[str, tuple[str, ...]]]:
         package = module if path.name == "__init__.py" else parent
         sources[module] = _digest_module(path, package)
         pending += (*sources[module][1], parent)
+        if module == stage_registry.__name__:
+            pending += stage_registry.STAGE_MODULES.values()  # imported by name
     return sources
 
 
@@ -242,9 +245,9 @@ def program_inputs(name: str, scenario: Scenario, loaded: tuple[str, ...] = ()) 
 
 
 def _data_files(stage: Stage) -> list[Path]:
-    """Schemas of the artefacts of a stage, and the templates beside its module."""
+    """Schemas of the artefacts of a stage, and the templates beside its module and those that it imports."""
     paths = [parquet.schema_folder() / f"{Path(name).stem}.schema.json" for name in stage.artefacts]
-    module = _module_path(stage.module)
-    if module is not None:
-        paths += sorted((module.parent / "templates").rglob("*"))
+    folders = {path.parent for path in map(_module_path, source_modules(stage.module)) if path is not None}
+    for folder in sorted(folders):
+        paths += sorted((folder / "templates").rglob("*"))
     return [path for path in paths if path.is_file()]

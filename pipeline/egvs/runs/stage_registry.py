@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,17 @@ from egvs.core import files
 from egvs.core.errors import with_relative_paths
 from egvs.core.resource_usage import ResourceUsage, measure_usage
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
+
+STAGE_MODULES = {
+    "check": "egvs.stages.check",
+    "statics": "egvs.stages.statics",
+    "scan": "egvs.stages.scan",
+    "traffic": "egvs.stages.traffic",
+    "tpog": "egvs.stages.tpog",
+    "score": "egvs.stages.score",
+    "report": "egvs.report.page",
+}
+"""Stage -> module with its declaration, ``STAGE``. Names, because runs do not know who presents them."""
 
 RANKING_STAGES = STAGE_NAMES[1:-1]
 """The stages that a ranking needs: all but the check and the report."""
@@ -47,37 +59,10 @@ class StageResult:
 
 def stage(name: str) -> Stage:
     """Return a stage; its module is imported only now, so that ``--help`` stays quick."""
-    match name:
-        case "check":
-            from egvs.stages.check import STAGE as check
-
-            return check
-        case "statics":
-            from egvs.stages.statics import STAGE as statics
-
-            return statics
-        case "scan":
-            from egvs.stages.scan import STAGE as scan
-
-            return scan
-        case "traffic":
-            from egvs.stages.traffic import STAGE as traffic
-
-            return traffic
-        case "tpog":
-            from egvs.stages.tpog import STAGE as tpog
-
-            return tpog
-        case "score":
-            from egvs.stages.score import STAGE as score
-
-            return score
-        case "report":
-            from egvs.report.page import STAGE as report
-
-            return report
-        case _:
-            raise ValueError(f"expected a stage ({', '.join(STAGE_NAMES)}), got {name!r}")
+    if name not in STAGE_MODULES:
+        raise ValueError(f"expected a stage ({', '.join(STAGE_NAMES)}), got {name!r}")
+    described: Stage = import_module(STAGE_MODULES[name]).STAGE
+    return described
 
 
 def stages_without_traffic() -> tuple[str, ...]:

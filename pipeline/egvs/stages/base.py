@@ -83,6 +83,8 @@ class Stage:
         Keyword arguments of ``run`` that change no artefact, for example where the work is done.
     reads_traffic
         Whether the stage reads files of recorded traffic that the scenario names.
+    is_view
+        Whether the stage presents a run to people: no result depends on it, and it is made again when one changes.
     prepare
         Functions that load what ``run`` calls, for example by calling kernels with made-up arguments, which compiles
         them in the first run; the function that takes longest comes first.
@@ -97,6 +99,7 @@ class Stage:
     code: tuple[str, ...] = ()
     neutral_options: tuple[str, ...] = ()
     reads_traffic: bool = False
+    is_view: bool = False
     prepare: tuple[Callable[[], None], ...] = ()
 
     @property

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from egvs._version import __version__
 from egvs.core import files
 from egvs.core.wording import format_percent
-from egvs.drawing import maps
-from egvs.drawing.colours import STYLE_SHEET, ColumnValues
+from egvs.drawing import maps, pages
+from egvs.drawing.colours import ColumnValues
 from egvs.drawing.maps import MapScale
 from egvs.drawing.svg_figures import FigureStyle
-from egvs.report import page
-from egvs.results import labels as formatting
 from egvs.studies import speed_figure
 from egvs.studies.tpog_comparison import LaneComparison, Measured, TpogComparison
 
@@ -50,26 +47,20 @@ def render_page(comparison: TpogComparison) -> str:
     comparison
         The numbers.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
-
-    environment = Environment(
-        loader=FileSystemLoader([TEMPLATES, page.TEMPLATES]), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters |= {
-        "svg": Markup, "percent": format_percent, "integer": formatting.format_count,
-        "measured": format_measured, "measured_share": format_share, "measured_bit": format_bit,
-        "measured_speed": format_speed,
-    }  # fmt: skip
-    html = environment.get_template("tpog.html.j2").render(
+    environment = pages.page_environment(
+        TEMPLATES,
+        measured=format_measured,
+        measured_share=format_share,
+        measured_bit=format_bit,
+        measured_speed=format_speed,
+    )
+    return pages.render(
+        environment,
+        "tpog.html.j2",
         comparison=comparison,
         figures=draw_maps(comparison),
         speeds=draw_lane_speeds(comparison),
-        style=Markup(STYLE_SHEET),
-        version=__version__,
     )
-    return formatting.keep_percentages_together(html)
 
 
 def format_measured(measured: Measured | None) -> str:

@@ -38,7 +38,7 @@ from egvs.core.special import cosdg, sindg
 from egvs.core.wording import format_percent, number_of
 from egvs.drawing.basemap import solid_group
 from egvs.formats import csv_tables
-from egvs.report.command_sections import DIGEST_KEY, what_if_digest
+from egvs.results.command_entries import DIGEST_KEY, what_if_digest
 from egvs.results.labels import ScoreLabel, format_probability, join_names
 from egvs.results.ranking import RankedSite, Ranking
 from egvs.results.sensors import ScoreDifference

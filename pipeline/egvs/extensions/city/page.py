@@ -16,18 +16,14 @@ from urllib.parse import quote
 
 import numpy as np
 
-from egvs._version import __version__
 from egvs.core import files
 from egvs.core.errors import Diagnostic
 from egvs.core.wording import format_percent
-from egvs.drawing import colours, maps
-from egvs.drawing.colours import STYLE_SHEET
+from egvs.drawing import colours, maps, pages
 from egvs.drawing.svg_figures import Box, ColourBar, MapFrame
 from egvs.extensions.city.budget_figure import budget_chart, curve_rows
 from egvs.extensions.city.model import NETWORK_FILE, City
 from egvs.extensions.city.results import RUNS_FOLDER, CityPlan, JunctionResult, counts_vehicles, gain_label
-from egvs.report import page
-from egvs.results import labels as formatting
 from egvs.traffic import network
 
 PAGE_FILE = "city.html"
@@ -185,16 +181,10 @@ def render_page(
     plan
         The plan of the city, if there is one.
     """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
-
-    environment = Environment(
-        loader=FileSystemLoader([CITY_TEMPLATES, page.TEMPLATES]), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters |= {"svg": Markup, "percent": format_percent, "integer": formatting.format_count}
     score = results[0].best.by
-    html = environment.get_template("city.html.j2").render(
+    return pages.render(
+        pages.page_environment(CITY_TEMPLATES),
+        "city.html.j2",
         city=city,
         results=results,
         score=score,
@@ -211,11 +201,8 @@ def render_page(
         max_gain=max(result.gain for result in results),
         sites=sum(result.sites for result in results),
         warnings=warnings,
-        style=Markup(STYLE_SHEET),
-        script=Markup((CITY_TEMPLATES / "sort.js").read_text(encoding="utf-8")),
-        version=__version__,
+        script=(CITY_TEMPLATES / "sort.js").read_text(encoding="utf-8"),
     )
-    return formatting.keep_percentages_together(html)
 
 
 def format_headline(results: Sequence[JunctionResult]) -> str:

@@ -26,8 +26,6 @@ from egvs._version import __version__
 from egvs.core.errors import EgvsError
 from egvs.core.package_data import SCHEMAS, data_folder
 
-STAGE_MODULES = tuple(f"egvs.stages.{name}" for name in ("check", "statics", "scan", "traffic", "tpog", "score"))
-
 TOKEN_PREFIX = ".egvs-worker-check-"
 """Beginning of the names of token files. The program that starts a run writes one into each folder that workers must
 see, and removes it at the end."""
@@ -96,7 +94,7 @@ def library_names() -> tuple[str, ...]:
     """Return the names of the installed libraries that results depend on."""
     from egvs.runs import stage_keys  # not on workers, where it would delay the answer
 
-    libraries = stage_keys.source_digest("egvs.runs.run", "egvs.report.page", *STAGE_MODULES).libraries
+    libraries = stage_keys.source_digest("egvs.runs.run").libraries
     return tuple(stage_keys.library_versions(libraries))
 
 

@@ -42,7 +42,7 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
 from egvs.extensions.hardware.design_request import ALL_SENSORS, DesignRequest
 from egvs.placement.refinement import Axis, BoxEnds, Freedom, minimise
-from egvs.report.command_sections import DIGEST_KEY, design_digest
+from egvs.results.command_entries import DIGEST_KEY, design_digest
 from egvs.results.sensors import ScoreDifference
 from egvs.runs import run, stage_registry
 from egvs.runs.command_results import add_to_report

@@ -5,27 +5,25 @@ The page is one file that loads nothing, for light and dark themes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs._version import __version__
 from egvs.artefacts.command_results import read_results
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.grid import FloatArray
-from egvs.drawing import colours
-from egvs.drawing.colours import STYLE_SHEET, IndexedImage
+from egvs.drawing import colours, pages
+from egvs.drawing.colours import IndexedImage
 from egvs.drawing.svg_figures import ColourBar, svg_start_tag
 from egvs.export.export import safe_file_name
 from egvs.extensions.hardware.installation.acceptance import Acceptance, describe_error
 from egvs.extensions.hardware.installation.planned_sites import path_in_run
 from egvs.extensions.hardware.installation.scan_comparison import NEARER_M, NEARER_SHARE, SURE_RANGE, ScanComparison
-from egvs.report import command_sections, page
-from egvs.results.labels import SCORE_LABELS, keep_percentages_together
+from egvs.results.labels import SCORE_LABELS
 from egvs.runs.command_results import add_to_report
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -103,7 +101,7 @@ def write_acceptance(run: str | Path, result: Acceptance, out: Path | None = Non
     written = write_files(out or folder.path / "acceptance", result)
     entry = {
         **result.to_json(),
-        "pose": command_sections.pose_json(result.pose.planned),
+        "pose": asdict(result.pose.planned),
         "path": path_in_run(written.page, folder),
     }
     reported = add_to_report(folder.path, RunFolder.acceptance, {result.site.name: entry})
@@ -112,21 +110,13 @@ def write_acceptance(run: str | Path, result: Acceptance, out: Path | None = Non
 
 def render_page(result: Acceptance) -> str:
     """Return the page, HTML text."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
-
-    environment = Environment(
-        loader=FileSystemLoader([TEMPLATES, page.TEMPLATES]), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters |= {"svg": Markup}
     images = range_images(result.comparison)
     label = None if result.score is None else SCORE_LABELS[result.score.name]
-    html = environment.get_template("acceptance.html.j2").render(
+    return pages.render(
+        pages.page_environment(TEMPLATES), "acceptance.html.j2",
         result=result, images=images, scale=_range_scale(images.peak_m), categories=CATEGORIES, label=label,
-        pose_rows=_pose_rows(result), style=Markup(STYLE_SHEET), version=__version__,
+        pose_rows=_pose_rows(result),
     )  # fmt: skip
-    return keep_percentages_together(html)
 
 
 def _pose_rows(result: Acceptance) -> list[tuple[str, str, str, str]]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -40,7 +40,6 @@ from egvs.extensions.hardware.installation.planned_sites import PlannedSites, pa
 from egvs.extensions.hardware.installation.tolerances import PoseTolerances, Tolerance
 from egvs.formats import georeference
 from egvs.formats.georeference import WorldFrame
-from egvs.report import command_sections
 from egvs.results.labels import SCORE_LABELS, format_degrees
 from egvs.runs.command_results import add_to_report
 from egvs.sensors.sensor import Sensor
@@ -300,7 +299,7 @@ def _report_entry(data: SheetData, path: Path, folder: RunFolder) -> dict[str, A
     """Return what the report says about a sheet, JSON values."""
     return {
         "sensor": data.sensor.name,
-        "pose": command_sections.pose_json(data.pose),
+        "pose": asdict(data.pose),
         "height_m": data.mounting_height_m,
         "bearing_deg": data.grid_bearing_deg,
         "tolerances": {row.quantity.name: describe_limit(row) for row in data.tolerances.tolerances},
