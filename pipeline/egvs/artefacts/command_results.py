@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egvs.artefacts.run_record import StageRecord
+from egvs.artefacts.run_record import StageRecord, is_current
 from egvs.core import files, reading
 from egvs.core.errors import InputError
 from egvs.core.files import add_checksum, has_valid_checksum
@@ -36,7 +36,7 @@ class CommandResult:
 
     def is_current(self, stages: Mapping[str, StageRecord]) -> bool:
         """Whether the result was computed from the same inputs as a run with these stages."""
-        return all(name in stages and stages[name].inputs == key for name, key in self.stages.items())
+        return is_current(self.stages, stages)
 
 
 def read_results(path: Path) -> dict[str, CommandResult]:

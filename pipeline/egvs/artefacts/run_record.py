@@ -18,6 +18,19 @@ from egvs.core.resource_usage import ResourceUsage
 from egvs.core.wording import list_first
 
 
+def is_current(keys: Mapping[str, str], stages: Mapping[str, StageRecord]) -> bool:
+    """Return whether a result was computed from the same inputs as a run.
+
+    Parameters
+    ----------
+    keys
+        Inputs (hash) of the stages that the result depends on, by their name.
+    stages
+        Records of the stages of the run.
+    """
+    return all(name in stages and stages[name].inputs == key for name, key in keys.items())
+
+
 @dataclass(frozen=True)
 class StageRecord:
     """The last run of one stage.
