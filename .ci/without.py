@@ -182,7 +182,7 @@ class ReducedProgram(Program):
         report("all modules can be imported; none names what was taken away")
 
     def check_help(self, names: Sequence[str]) -> None:
-        """Check that the help lists no command of the extensions, and that each is refused with the extension's name."""
+        """Check that the help lists no command of the extensions, and that each is refused with a reason."""
         listed = re.findall(r"^\W*(\w[\w-]*)  ", self.python("egvs --help", "-m", "egvs", "--help"), re.MULTILINE)
         if "run" not in listed:
             sys.exit(f"egvs --help lists no command run: {listed}")
