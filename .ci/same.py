@@ -19,8 +19,8 @@ from typing import Any
 import pyarrow.parquet as pq
 
 IGNORED_KEYS = (
-    "created", "duration_s", "host", "inputs", "key", "keys", "pandas", "peak_memory_bytes", "program", "seconds",
-    "stage_key", "started", "version",
+    "cost", "created", "duration_s", "host", "inputs", "key", "keys", "kilobytes", "own_sha256", "pandas",
+    "peak_memory_bytes", "program", "seconds", "stage_key", "started", "sumo_peak_mb", "sumo_seconds", "version",
 )  # fmt: skip
 """Keys of JSON and of Parquet metadata that differ between any two runs or versions."""
 
@@ -28,6 +28,7 @@ IGNORED_FILES = (".digests", ".lock", ".unchanged")
 """How the names of files begin that are only valid for one folder."""
 
 MASKS = (
+    r"(?s)<h3>Cost of each stage</h3>.*?</table>",  # of a report
     r"\b\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d)?(\.\d+)?(Z|[+-]\d\d:?\d\d)?)?",  # dates
     r"\b\d[\d.,]*\s?(?:ms|s|min|kB|MB|GB)\b",  # times and sizes
     r"\b[0-9a-f]{16,64}\b",  # hashes
