@@ -56,7 +56,7 @@ for entry in importlib.metadata.distribution("egvs").entry_points:
     if entry.value.startswith(prefixes):
         problems.append(f"entry point {entry}")
 print(egvs.__file__)
-sys.exit("; ".join(problems))
+sys.exit("; ".join(problems) or 0)
 """
 
 
