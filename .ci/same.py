@@ -28,7 +28,7 @@ IGNORED_FILES = (".digests", ".lock", ".unchanged")
 """How the names of files begin that are only valid for one folder."""
 
 MASKS = (
-    r"(?s)<h3>Cost of each stage</h3>.*?</table>",  # of a report
+    r"<h3>Cost of each stage</h3>[\s\S]*?</table>",  # in the report
     r"\b\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d)?(\.\d+)?(Z|[+-]\d\d:?\d\d)?)?",  # dates
     r"\b\d[\d.,]*\s?(?:ms|s|min|kB|MB|GB)\b",  # times and sizes
     r"\b[0-9a-f]{16,64}\b",  # hashes

@@ -49,7 +49,7 @@ from egvs.scoring.scorer import Scorer
 from egvs.scoring.visibility import Beams, HitCounter, to_voxel_units
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
-from egvs.stages import inputs, tpog
+from egvs.stages import scene_inputs, tpog
 from egvs.world.mesh import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -141,7 +141,7 @@ def occupancy(folder: Path, sumo: float) -> list[tuple[str, str, str, bool]]:
 def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
     """Time scan and score of single sites: from static world and TPOG in memory to a score."""
     scenario, run = egvs.load(SCENARIO), folder / "run"
-    scene = inputs.resolve_scene(scenario, read_ply(run / "statics.ply")[0])
+    scene = scene_inputs.resolve_scene(scenario, read_ply(run / "statics.ply")[0])
     occupancy_grid = read_tpog(run / "tpog.parquet")
     scanner, scorer, visibility = Scanner(scene), Scorer(scene, occupancy_grid), HitCounter(scene, occupancy_grid)
     beams = {site: Beams.of(scanner.scan_site(site)) for site in scene.sites}

@@ -15,12 +15,8 @@ from typing import Any
 import numpy as np
 from tests.extensions.validation import simulated_studies
 
-from egvs.extensions.validation.correlation import (
-    COEFFICIENT_KINDS,
-    ConfidenceInterval,
-    Correlation,
-    CorrelationStudy,
-)
+from egvs.extensions.validation.correlation import ConfidenceInterval, Correlation, CorrelationStudy
+from egvs.statistics.ranks import COEFFICIENT_KINDS
 
 SITES, RHOS, STUDIES, RESAMPLES = (13, 40), (0.0, 0.5, 0.8, 0.95), 1000, 1000
 PAIR = (0.8, 0.5)

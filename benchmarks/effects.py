@@ -18,7 +18,7 @@ import egvs
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.scoring.visibility import Beams, HitCounter
 from egvs.sensors.scanner import Scanner
-from egvs.stages import inputs
+from egvs.stages import scene_inputs
 from egvs.world.mesh import World, read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -50,7 +50,7 @@ class Work:
     @classmethod
     def of(cls, settings: list[str], world: World, tpog: Tpog, run: Path) -> Work:
         """Prepare the static world, TPOG and trajectories of a finished run."""
-        scene = inputs.resolve_scene(egvs.load(SCENARIO, settings), world)
+        scene = scene_inputs.resolve_scene(egvs.load(SCENARIO, settings), world)
         scanner = Scanner(scene)
         beams = [Beams.of(scanner.scan_site(site)) for site in scene.sites[:SITES]]
         return cls(HitCounter(scene, tpog, run / "trajectories.parquet"), beams, np.flatnonzero(tpog.counts))

@@ -38,7 +38,7 @@ for module in modules:
     import_module(module)
 import egvs
 from egvs.sensors.scanner import Scanner
-from egvs.stages.inputs import open_folder
+from egvs.runs.run_context import open_folder
 scene = open_folder(egvs.load(scenario), Path(folder)).scene
 marks_s = [time.process_time()]
 if "numba" in options:

@@ -23,7 +23,6 @@ from egvs.scenario.loading import load
 from egvs.scoring.scorer import Scorer
 from egvs.scoring.standard_errors import BlockJackknife, ScoreUncertainty
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import get_scene
 from egvs.stages.site_scans import empty_scans
 from egvs.studies.measurement import SettingRunner
 from egvs.studies.study_settings import Setting
@@ -94,7 +93,7 @@ def score_seed(runner: SettingRunner, seed: int) -> SeedScores:
         jackknife = BlockJackknife.of(work.folder.tpog, tpog)
         if jackknife is None:
             raise EgvsError("tpog.blocks: standard errors need at least 2 blocks, got 1")
-        scorer = Scorer(get_scene(work), tpog, work.folder.trajectories, jackknife)
+        scorer = Scorer(work.scene, tpog, work.folder.trajectories, jackknife)
         sites, replicates = [], []
         for scan in empty_scans(work):
             sites.append(scan.site.name)
@@ -118,7 +117,7 @@ def run_seeds(runner: SettingRunner, first: int, count: int, report: Callable[[s
 
 def scores_against(work: StageContext, tpog: Tpog) -> FloatArray:
     """Return the EGVS of the scans of a run folder with another TPOG on its grid, (n,) float64."""
-    scorer = Scorer(get_scene(work), tpog, work.folder.trajectories)
+    scorer = Scorer(work.scene, tpog, work.folder.trajectories)
     return np.array([scorer.score(scan.beams).egvs for scan in empty_scans(work)])
 
 

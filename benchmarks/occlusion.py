@@ -22,10 +22,10 @@ from scipy.stats import kendalltau
 import egvs
 from egvs.artefacts.tpog import read_tpog
 from egvs.effects.moving_occlusion import read_replay
+from egvs.runs.run_context import open_folder
 from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.model import Scenario
 from egvs.scoring.scorer import Scorer, ranks
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.site_scans import empty_scans
 
 Compared = dict[str, Any]
@@ -80,7 +80,7 @@ def scored(scenario: Scenario, out: Path, parameters: dict[str, Any] | None) -> 
     effects = others if parameters is None else {**others, "moving_occlusion": parameters}
     work = open_folder(scenario.with_effects(EffectsConfig.from_dict(effects)), out)
     tpog, trajectories, scans = read_tpog(out / "tpog.parquet"), out / "trajectories.parquet", list(empty_scans(work))
-    scorer = Scorer(get_scene(work), tpog, trajectories)
+    scorer = Scorer(work.scene, tpog, trajectories)
     scorer.score(scans[0].beams)
     start = time.perf_counter()
     egvs = [scorer.score(scan.beams).egvs for scan in scans]

@@ -28,11 +28,11 @@ from egvs.effects import registry
 from egvs.effects.registry import AUTO_ENABLED
 from egvs.results.ranking import RankedSite
 from egvs.runs import run
+from egvs.runs.run_context import open_folder
 from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.model import Scenario
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import Scorer
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.site_scans import empty_scans
 from egvs.world.mesh import read_ply
 
@@ -68,7 +68,7 @@ def column_scores(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray,
     field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
     work = open_folder(scenario, out)
     scan = next(empty_scans(work, [site]))
-    hits = Scorer(get_scene(work), tpog, out / "trajectories.parquet").hits(scan.beams)
+    hits = Scorer(work.scene, tpog, out / "trajectories.parquet").hits(scan.beams)
     score_bit = field.per_cell_bit * np.minimum(hits.ravel()[field.cells], scenario.gamma)
     nx, ny, nz = tpog.grid.shape
     return np.bincount(field.cells // nz, weights=score_bit, minlength=nx * ny).reshape(nx, ny), hits > 0

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts.frame_boxes import FrameBoxes, read_boxes
+from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
 from egvs.scoring.occupancy import near_grid
 from egvs.stages import traffic
-from egvs.stages.inputs import open_folder
 
 
 def run_stage(stage: Any, scenario: Scenario, folder: Path, **options: Any) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from egvs.extensions.validation.detector_runs import SiteDetectionTask
 from egvs.extensions.validation.detectors import base
 from egvs.extensions.validation.held_out_traffic import MIN_SPACING_S, HeldOutTraffic, prepare_held_out_traffic
 from egvs.runs.run import ensure_stages
+from egvs.runs.run_context import open_folder
 from egvs.scenario.score_config import DEFAULT_SAMPLED_FRAMES
 from egvs.scoring import target_scores
 from egvs.scoring.scorer import Scorer
@@ -35,8 +36,7 @@ from egvs.scoring.targets import TargetRecord, detection_probability, visible_ta
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
-from egvs.stages import inputs
-from egvs.stages.inputs import open_folder
+from egvs.stages import scene_inputs
 from egvs.world.mesh import read_ply
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
@@ -96,7 +96,7 @@ def _score_costs(folder: Path) -> tuple[dict[str, float], int]:
     folder.mkdir()
     work = open_folder(egvs.load(SCENARIO), folder)
     ensure_stages(work, "statics", "traffic", "tpog")  # not part of the measurement
-    scene = inputs.resolve_scene(work.scenario, read_ply(work.path("statics.ply"))[0])
+    scene = scene_inputs.resolve_scene(work.scenario, read_ply(work.path("statics.ply"))[0])
     counted = read_tpog(work.path("tpog.parquet"))
     record = TargetRecord.read(work.path("trajectories.parquet"), counted.grid)
     scanner, scorer = Scanner(scene), Scorer(scene, counted)

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
 from egvs.stages.base import StageDependencies
-from egvs.stages.inputs import open_folder
 
 
 def run_stage(

@@ -21,10 +21,10 @@ from egvs.core import files
 from egvs.core.errors import EgvsError, InputError
 from egvs.extensions.validation.held_out_traffic import prepare_held_out_traffic
 from egvs.runs.run import ensure_stages
+from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.traffic import sumo_folder
 from egvs.world.carriageway import Carriageway
 
@@ -82,7 +82,7 @@ def _candidates(protocol: Protocol, junction: Junction, scenario: Scenario, fold
     with tempfile.TemporaryDirectory(prefix=".work-", dir=_existing(folder)) as temporary:
         work = open_folder(scenario, Path(temporary))
         ensure_stages(work, "statics")
-        scene = get_scene(work)
+        scene = work.scene
         roads = sumo_folder.read_network(scenario)
         return draw_candidates(protocol, junction, scene, None if roads is None else Carriageway.of(roads))
 

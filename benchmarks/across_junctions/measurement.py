@@ -31,6 +31,7 @@ from egvs.extensions.validation import surrogates
 from egvs.extensions.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
 from egvs.extensions.validation.results import ScoreName
 from egvs.runs import stage_keys
+from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
 from egvs.scoring.targets import TargetRecord, VisibleTargets, detection_probability, visible_targets
@@ -39,7 +40,6 @@ from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Site
-from egvs.stages.inputs import get_scene, open_folder
 
 FEWER_FRAMES = {"chongqing": 1000}
 """Frames of the traffic behind the scores, where the protocol's number does not fit: the recorded people of chongqing
@@ -254,7 +254,7 @@ def _measure_scores(
 
 def _mean_points(scenario: Scenario, work: Path, jobs: int | None) -> dict[str, float]:
     """Return the mean number of points on a vehicle of the traffic behind the scores, by site."""
-    scene = get_scene(open_folder(scenario, work))
+    scene = open_folder(scenario, work).scene
     record = TargetRecord.read(work / "trajectories.parquet", scenario.roi.grid)
     return {
         site.name: float(visible.points.mean()) if len(visible) else float("nan")

@@ -41,17 +41,11 @@ from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from egvs.core.grid import FloatArray
-from egvs.extensions.validation.correlation import (
-    MIN_POLES,
-    MIN_VALUES,
-    ConfidenceInterval,
-    MeasureValues,
-    Resamples,
-    StandardisedValues,
-    average_ranks,
-)
+from egvs.extensions.validation.correlation import MIN_POLES, ConfidenceInterval, MeasureValues, Resamples
+from egvs.statistics.ranks import MIN_VALUES, StandardisedValues
 
 SEED, RESAMPLES = 3702, 2000
 
@@ -89,7 +83,7 @@ def rho_given(scores: FloatArray, ap: FloatArray, explained: FloatArray) -> Floa
     explained
         Projections onto the effects of these properties, of :func:`projections`, (rows, n, n).
     """
-    ranks = np.stack([average_ranks(scores), average_ranks(ap)], axis=2)
+    ranks = np.stack([rankdata(scores, axis=1), rankdata(ap, axis=1)], axis=2)
     rest = ranks - explained @ ranks
     product = np.einsum("ij,ij->i", rest[:, :, 0], rest[:, :, 1])
     squares = (rest**2).sum(axis=1)

@@ -26,6 +26,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import rankdata
 
 from benchmarks.across_junctions import calibration, table_files
 from benchmarks.across_junctions.detections import AP
@@ -46,7 +47,7 @@ from benchmarks.across_junctions.statistics import (
 from benchmarks.across_junctions.table_files import Cell, Column, Table, number, with_interval
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.extensions.validation.correlation import MeasureValues, average_ranks
+from egvs.extensions.validation.correlation import MeasureValues
 from egvs.scoring.target_scores import DETECTORS
 
 UNSEEN_ROLES = tuple(role for role in ROLES if role != "training")
@@ -647,7 +648,7 @@ class TrainedBaselines:
         for record in records:
             ap = record.detections[detector][AP].values
             rows = np.isfinite(ap)
-            ranks = average_ranks(ap[rows][None, :])[0]
+            ranks = rankdata(ap[rows])
             shares.append((ranks - 0.5) / max(len(ranks), 1))
             effects.append(self._effects(record.sensors, record.height_m)[rows])
         share, effect = np.concatenate(shares), np.concatenate(effects)

@@ -28,7 +28,6 @@ from benchmarks.across_junctions.detections import hits_of
 from egvs.clouds.sweeps import DetectedBoxes, DetectorResult
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray
-from egvs.extensions.validation.correlation import StandardisedValues
 from egvs.extensions.validation.detection_metrics import (
     ALL_OBJECTS,
     BLOCKS,
@@ -47,6 +46,7 @@ from egvs.scoring.targets import TargetRecord, VisibleTargets, detection_probabi
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
+from egvs.statistics.ranks import StandardisedValues
 
 APART_S = 7.0
 """Between frames, as in the study of validity."""

@@ -20,7 +20,7 @@ from egvs.artefacts.run_record import RunRecord
 from egvs.placement import plan, problem_builder, solver
 from egvs.placement.plan import REQUIRED_STAGES
 from egvs.runs import run, stage_registry
-from egvs.stages.inputs import open_folder
+from egvs.runs.run_context import open_folder
 
 SCENARIOS = Path(__file__).parent.parent.parent / "scenarios"
 

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.creation import map_readers, sumo_network
 from egvs.creation.openstreetmap import reader as openstreetmap
@@ -68,14 +67,14 @@ def test_rejects_truncated_file_in_folder_by_name(tmp_path: Path, run_egvs) -> N
 
 def test_rejects_unreadable_file_in_folder_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "locked.gml").write_text("<CityModel/>")
-    real = files.open_input
+    real = map_readers.open_input
 
     def open_input(path: Path) -> object:
         if path.name == "locked.gml":
             raise PermissionError(13, "Permission denied", str(path))
         return real(path)
 
-    monkeypatch.setattr(files, "open_input", open_input)
+    monkeypatch.setattr(map_readers, "open_input", open_input)
     with pytest.raises(InputError, match=r"locked.gml: the file cannot be read \(Permission denied\)"):
         map_readers.list_files([tmp_path])
 

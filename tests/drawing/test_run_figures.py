@@ -16,9 +16,9 @@ from egvs.artefacts.readers import MAX_LOCATIONS, LocationVisibility, SiteBlinds
 from egvs.artefacts.tpog import read_tpog
 from egvs.drawing import maps
 from egvs.drawing import run_figures as figures
+from egvs.runs.run_context import open_folder
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import Scorer
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.site_scoring import empty_scans
 from tests.report.small_runs import PageReader, render_report, run_to_scores, site_data
 
@@ -122,7 +122,7 @@ def test_views_agree_with_the_scores(plain_run):
     field = EntropyField.of(tpog.counts, tpog.frames, tpog.grid)
     rows = {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
     work = open_folder(scenario, out)
-    scorer = Scorer(get_scene(work), tpog)
+    scorer = Scorer(work.scene, tpog)
     for site_scan in empty_scans(work, ["north", "west"]):
         name, crossed = site_scan.site.name, scorer.hits(site_scan.beams).ravel()[field.cells] > 0
         assert field.per_cell_bit[crossed].sum() / field.per_cell_bit.sum() == pytest.approx(rows[name]["entropy_seen"])

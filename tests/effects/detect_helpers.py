@@ -12,11 +12,11 @@ from egvs.artefacts import parquet
 from egvs.artefacts.tpog import read_tpog
 from egvs.effects import registry
 from egvs.effects.base import Effect
+from egvs.runs.run_context import open_folder
 from egvs.scoring.scorer import Scorer
 from egvs.sensors import sensor, sites
 from egvs.sensors.scene import Scene
 from egvs.stages import scan, score, statics, tpog, traffic
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.site_scoring import empty_scans
 from tests.conftest import BUILDING, collection, fcd, feature
 from tests.stage_runner import run_stage
@@ -63,7 +63,7 @@ def score_hits(score_run: tuple[Path, Path], settings: list[str]) -> np.ndarray:
     scenario = egvs.load(folder, settings)
     work = open_folder(scenario, out)
     first = next(iter(empty_scans(work)))
-    return Scorer(get_scene(work), read_tpog(out / "tpog.parquet")).hits(first.beams)
+    return Scorer(work.scene, read_tpog(out / "tpog.parquet")).hits(first.beams)
 
 
 def hits_along_beam(one_beam_run: tuple[Path, Path], *settings: str) -> np.ndarray:

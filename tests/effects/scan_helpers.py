@@ -12,9 +12,9 @@ import shapely
 import egvs
 from egvs.artefacts.tpog import Tpog
 from egvs.core.grid import Grid, Roi
+from egvs.runs.run_context import open_folder
 from egvs.scoring.scorer import Scorer
 from egvs.stages import scan, statics
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.site_scoring import empty_scans
 from egvs.world import static_world
 from egvs.world.footprints import Footprint
@@ -77,7 +77,7 @@ def scan_hits(folder: Path, out: Path, *sets: str) -> dict[str, np.ndarray]:
     scenario, out = run_scan(folder, out, *sets)
     grid = Grid.over(scenario.roi.box, scenario.roi.voxel_m)
     work, empty = open_folder(scenario, out), Tpog(grid, 1, np.zeros(grid.shape, dtype=np.int64))
-    scorer = Scorer(get_scene(work), empty)
+    scorer = Scorer(work.scene, empty)
     return {scan.site.name: scorer.hits(scan.beams) for scan in empty_scans(work)}
 
 

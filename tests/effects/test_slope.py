@@ -14,7 +14,7 @@ from egvs.scenario.effects_config import SlopeParameters
 from egvs.scenario.loading import scenario_from_dict
 from egvs.sensors import sites
 from egvs.sensors.scanner import Scanner
-from egvs.stages import inputs, statics
+from egvs.stages import scene_inputs, statics
 from egvs.traffic import fcd, network, sumo, vehicle_boxes
 from egvs.traffic.fcd import FrameGroup
 from egvs.traffic.vehicle_boxes import VehicleSize
@@ -133,10 +133,10 @@ def test_footprints_are_on_the_hill_and_sites_below_it_rejected(hill_road, tmp_p
     }
     assert tops["h"] == pytest.approx(6 + 5, abs=0.2) and spans["h"] == pytest.approx(5 + 10 * GRADE, abs=0.2)
     assert tops["p"] == pytest.approx(10 + 5, abs=0.1) and spans["p"] == pytest.approx(3)
-    Scanner(inputs.resolve_scene(scene, world)).check(sites.candidate_sites(scene))
+    Scanner(scene_inputs.resolve_scene(scene, world)).check(sites.candidate_sites(scene))
     low = values | {"sites": {"grid": {"low_m": [300, 10], "high_m": [300, 10], "spacing_m": 1, "heights_m": [5]}}}
     with pytest.raises(InputError, match=r"z_m = 5 is not above the ground \(z = (6|5\.9\d*)\)"):
-        below = inputs.resolve_scene(scenario_from_dict(low, tmp_path, "place"), world)
+        below = scene_inputs.resolve_scene(scenario_from_dict(low, tmp_path, "place"), world)
         Scanner(below).check(below.sites)
 
 

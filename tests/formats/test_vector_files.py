@@ -19,7 +19,7 @@ from egvs.core.grid import Roi
 from egvs.formats import vector_files
 from egvs.formats.georeference import Georeference, WorldFrame
 from egvs.sensors import sites
-from egvs.stages.scene_inputs import site_digests
+from egvs.stages.scene_dependencies import site_digests
 from egvs.world.footprints import read_footprints
 from tests.sensors.helpers import site_positions
 

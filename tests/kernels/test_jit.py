@@ -104,7 +104,7 @@ import sys
 import numpy as np
 from egvs.kernels.sums import sums
 print(sums(np.array([1.0, 4.0])).tolist(), "compiled" if sums.stats.cache_misses else "cached")
-print("numba.np.arraymath" in sys.modules or "scipy.linalg" in sys.modules)
+print("numba.typed.dictimpl" in sys.modules)  # serves to compile dictionaries
 """
 CALLS_SUMS = """
 from egvs.kernels.jit import njit
@@ -118,7 +118,7 @@ CALL_DOUBLED = CALL_SUMS.replace("sums", "doubled")
 
 
 @pytest.mark.slow
-def test_cached_kernel_is_loaded_without_the_modules_that_compile_it(package: Path) -> None:
+def test_cached_kernel_is_loaded_without_numbas_implementations(package: Path) -> None:
     (package / "egvs" / "kernels" / "sums.py").write_text(SUMS)
     (package / "egvs" / "kernels" / "doubled.py").write_text(CALLS_SUMS)
     assert call(package, CALL_SUMS).splitlines() == ["[5.0, 1.0] compiled", "True"]

@@ -15,13 +15,13 @@ import egvs
 from egvs.placement import fused_score
 from egvs.placement.fused_score import FusedScore, improve_by_fused_swaps
 from egvs.placement.problem import Plan, PlanRules, Problem
+from egvs.runs.run_context import open_folder
 from egvs.scoring.fused_targets import fuse_targets
 from egvs.scoring.target_scores import expected_detections
 from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Pose
-from egvs.stages.inputs import get_scene, open_folder
 from tests.conftest import write_mini
 from tests.placement.instances import make_matrix, make_term
 
@@ -112,7 +112,7 @@ def placed(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     scenario = egvs.load(folder, [FOUND, "placement.count=2", "tpog.blocks=10"])
     out = folder.parent / "out"
     placement = egvs.place(scenario, out)
-    scene = get_scene(open_folder(scenario, out))
+    scene = open_folder(scenario, out).scene
     record = TargetRecord.read(out / "trajectories.parquet", scenario.roi.grid, scenario.score.sampled_frames)
     scanner = Scanner(scene)
     views = {site.name: visible_targets(record, Beams.of(scanner.scan_site(site))) for site in scene.sites}
@@ -160,7 +160,7 @@ def test_refined_sensors_are_scanned_where_they_are(placed: SimpleNamespace) -> 
     scenario = egvs.load(placed.folder, [FOUND, "placement.count=2", "tpog.blocks=10", *limits])
     refined = egvs.place(scenario, placed.out)
     assert refined.refinement is not None and any(sensor.moved_m for sensor in refined.sensors)
-    scene = get_scene(open_folder(scenario, placed.out))
+    scene = open_folder(scenario, placed.out).scene
     record = next(iter(placed.views.values())).record
     views = []
     for sensor in refined.sensors:

@@ -14,7 +14,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_periods
 from egvs.results.plans import ERROR_COLUMNS, plan_steps
-from egvs.scoring.standard_errors import standard_error_inflation
+from egvs.statistics.blocks import standard_error_inflation
 
 FOUR_SITES = """site,x_m,y_m,z_m
 a,10,12,3

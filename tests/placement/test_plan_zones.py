@@ -16,10 +16,10 @@ from egvs.artefacts import readers
 from egvs.cli import place as place_cli
 from egvs.core.errors import InputError
 from egvs.placement import plan
+from egvs.runs.run_context import open_folder
 from egvs.scenario import loading
 from egvs.scoring.target_scores import detection_chances
 from egvs.stages import site_scoring
-from egvs.stages.inputs import open_folder
 from egvs.stages.site_scans import empty_scans
 from tests.conftest import collection, feature
 

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from egvs.artefacts import parquet
-from egvs.report.sections import FROM_SENSOR_NOTE, RHO, RHO_RANGE, egvs_setting, ranking_disagreement
+from egvs.report.sections import FROM_SENSOR_NOTE, RHO_RANGE, egvs_setting, ranking_disagreement
+from egvs.results.study_results import STUDY
 from egvs.studies import study_settings
 from egvs.studies.accuracy import StudyOptions
 from tests.results.test_ranking import by_vehicles, ranking
@@ -55,7 +56,8 @@ def test_evidence_equals_the_tables_of_the_study() -> None:
     rho = {row["score"]: {name: round(float(row[name]), 2) for name in ("cluster", "pointpillars")} for row in rows}
     expected = {name: row for name, row in rho.items() if name.startswith("egvs ")}
     expected["expected_detections"] = rho["expected_detections (detectors cluster+pointpillars)"]
-    assert expected == RHO and {egvs_setting(10.0, 0.25), egvs_setting(2.0, 0.5, moving_occlusion=True)} < set(RHO)
+    assert expected == STUDY.first_study.rho
+    assert {egvs_setting(10.0, 0.25), egvs_setting(2.0, 0.5, moving_occlusion=True)} < set(expected)
 
 
 def test_is_silent_if_scores_agree() -> None:

@@ -29,8 +29,8 @@ from egvs.core.errors import InputError, RunError
 from egvs.core.resource_usage import ResourceUsage
 from egvs.runs import run, stage_keys, stage_registry
 from egvs.runs.background import run_in_background
+from egvs.runs.run_context import open_folder
 from egvs.runs.store import Store
-from egvs.stages.inputs import open_folder
 from egvs.traffic import sumo
 from tests.traffic.helpers import fake_sumo
 

@@ -13,9 +13,9 @@ import pytest
 
 import egvs
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core import files
-from egvs.runs import digest_cache
-from egvs.runs.digest_cache import DigestCache, forget_digests, remember_digests
+from egvs.core import digests, files
+from egvs.core.digests import hash_input
+from egvs.runs.digest_cache import forget_digests, remember_digests
 from tests.conftest import write_mini
 
 OLD_S = 1_000_000_000
@@ -26,19 +26,18 @@ def sha256(content: bytes) -> str:
 
 
 class HashedFiles:
-    """Hashes files of a cache, and lists them."""
+    """Hashes files in runs of their own, and lists those that are read."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self._folder = RunFolder(folder)
         self.paths: list[Path] = []
+        monkeypatch.setattr(files, "hash_file", self._hash)
 
     def digest(self, path: Path) -> str:
         """The digest of a file in a run of its own."""
         self.paths.clear()
-        cache = DigestCache(self._folder)
-        digest = cache.digest(path, self._hash)
-        cache.save()
-        return digest
+        with remember_digests(self._folder):
+            return hash_input(path)
 
     def _hash(self, path: Path) -> str:
         self.paths.append(path)
@@ -48,12 +47,12 @@ class HashedFiles:
 @pytest.fixture
 def all_local(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The temporary folder counts as a local file system, wherever the tests run."""
-    monkeypatch.setattr(digest_cache, "_local_devices", lambda: frozenset({tmp_path.stat().st_dev}))
+    monkeypatch.setattr(digests, "_local_devices", lambda: frozenset({tmp_path.stat().st_dev}))
 
 
 @pytest.fixture
-def hashed(tmp_path: Path) -> HashedFiles:
-    return HashedFiles(tmp_path)
+def hashed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> HashedFiles:
+    return HashedFiles(tmp_path, monkeypatch)
 
 
 def write_old(path: Path, content: bytes) -> None:
@@ -81,8 +80,8 @@ def test_edit_within_resolution_of_time_stamps_is_found(
     all_local: None, hashed: HashedFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "a").write_bytes(b"one")
-    stamp = digest_cache.file_stamp(str(tmp_path / "a"))
-    monkeypatch.setattr(digest_cache, "file_stamp", lambda name: stamp)  # both edits within one tick of its clock
+    stamp = digests._file_stamp(str(tmp_path / "a"))
+    monkeypatch.setattr(digests, "_file_stamp", lambda name: stamp)  # both edits within one tick of its clock
     assert hashed.digest(tmp_path / "a") == sha256(b"one")
     (tmp_path / "a").write_bytes(b"two")
     assert hashed.digest(tmp_path / "a") == sha256(b"two")
@@ -113,7 +112,7 @@ def test_file_that_may_be_another_one_is_hashed(
 def test_file_on_unknown_file_system_is_always_hashed(
     hashed: HashedFiles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(digest_cache, "_local_devices", frozenset)
+    monkeypatch.setattr(digests, "_local_devices", frozenset)
     write_old(tmp_path / "a", b"one")
     for _ in range(2):
         assert hashed.digest(tmp_path / "a") == sha256(b"one")
@@ -133,7 +132,7 @@ def test_damaged_cache_is_ignored(all_local: None, hashed: HashedFiles, tmp_path
 def test_cache_is_not_written_after_error(all_local: None, tmp_path: Path) -> None:
     write_old(tmp_path / "a", b"one")
     with pytest.raises(KeyError), remember_digests(RunFolder(tmp_path)):
-        files.hash_file(tmp_path / "a")
+        hash_input(tmp_path / "a")
         raise KeyError
     assert not (tmp_path / ".digests.json").exists()
 
@@ -153,13 +152,13 @@ def test_mount_table_lists_local_file_systems(tmp_path: Path, monkeypatch: pytes
         "30 27 0:51 / /net rw shared:7 master:2 - nfs4 server:/home rw\n"
         "31 27 0:52 / /mnt rw - fuse.sshfs host: rw\n"
     )
-    monkeypatch.setattr(digest_cache, "_MOUNTS", table)
-    digest_cache._local_devices.cache_clear()
-    assert digest_cache._local_devices() == {os.makedev(254, 3)}
-    monkeypatch.setattr(digest_cache, "_MOUNTS", tmp_path / "absent")
-    digest_cache._local_devices.cache_clear()
-    assert digest_cache._local_devices() == frozenset()
-    digest_cache._local_devices.cache_clear()
+    monkeypatch.setattr(digests, "_MOUNTS", table)
+    digests._local_devices.cache_clear()
+    assert digests._local_devices() == {os.makedev(254, 3)}
+    monkeypatch.setattr(digests, "_MOUNTS", tmp_path / "absent")
+    digests._local_devices.cache_clear()
+    assert digests._local_devices() == frozenset()
+    digests._local_devices.cache_clear()
 
 
 @pytest.mark.slow

@@ -14,8 +14,8 @@ from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.files import add_checksum
 from egvs.runs import run
-from egvs.stages import inputs
-from egvs.stages.inputs import open_folder
+from egvs.runs.run_context import open_folder
+from egvs.stages import scene_inputs
 from egvs.studies.effect_study import EffectTrials
 
 READ_BY = {
@@ -134,7 +134,7 @@ def test_report_is_not_refreshed_from_altered_artefacts(runs, out: Path) -> None
 
 @pytest.mark.parametrize("name", ["trajectories.parquet", "tpog.parquet", "statics.ply"])
 def test_effect_study_rejects_altered_traffic(runs, out: Path, name: str) -> None:
-    scene = inputs.resolve_scene(runs[0], open_folder(runs[0], out).world)
+    scene = scene_inputs.resolve_scene(runs[0], open_folder(runs[0], out).world)
     assert EffectTrials.from_run(scene, out) is not None
     shutil.copyfile(runs[2] / name, out / name)
     assert EffectTrials.from_run(scene, out) is None

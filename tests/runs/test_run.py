@@ -24,6 +24,7 @@ from egvs.runs import run, stage_registry, verification
 from egvs.runs.run import lock_run_folder
 from egvs.world import ray_casting
 from tests import processes
+from tests.conftest import fcd, write_mini
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", "scores.parquet", "blindspots.parquet")
@@ -86,6 +87,7 @@ def test_second_run_skips_every_stage(done: tuple[Path, Path], run_egvs) -> None
     code, printed, said = run_egvs("run", mini, "--out", out)
     assert code == 0
     assert said.count("unchanged") == len(STAGE_NAMES)
+    assert said.endswith("no stage ran: no input has changed since the last run\n")
     assert "pole_a" in printed
     assert before == {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and not p.name.startswith(".")}
 
@@ -110,6 +112,48 @@ def test_changed_setting_runs_dependent_stages(
     fresh = tmp_path / "fresh"
     egvs.run(scenario, fresh)
     assert digests(out) == digests(fresh)  # nothing of the earlier run shows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("option", [(), ("--all",), ("--top", 1), ("--verbose",)])
+def test_run_without_changes_prints_what_complete_run_printed(
+    mini: Path, tmp_path: Path, run_egvs, option: tuple[object, ...]
+) -> None:
+    command = ("run", mini, "--out", tmp_path / "out", *option)
+    _, printed, said = run_egvs(*command)
+    assert "no stage ran" not in said
+    code, printed_again, said = run_egvs(*command)
+    assert (code, printed_again) == (0, printed)
+    assert "no stage ran" in said
+
+
+CHANGED_FILES = {
+    "base/sites.csv": {"check", "scan"},
+    "base/statics.geojson": {"check", "statics", "scan"},
+    "base/fcd.csv": {"check", "traffic"},
+    "base/wall.obj": {"statics", "scan"},
+    "base/paint.mtl": {"statics", "scan"},
+    "derived/fcd.csv": {"check", "traffic"},
+}
+"""File -> stages that run again at least, after something was appended to it, or it was added."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHANGED_FILES)
+def test_changed_file_runs_dependent_stages(tmp_path: Path, name: str) -> None:
+    base = write_mini(tmp_path / "base")
+    (base / "wall.obj").write_text("mtllib paint.mtl\nv 1 9 0\nv 2 9 0\nv 1 9 3\nf 1 2 3\n")
+    text = (base / "scenario.toml").read_text()
+    (base / "scenario.toml").write_text(text.replace("[tpog]", '[[statics.meshes]]\nfile = "wall.obj"\n\n[tpog]'))
+    (tmp_path / "derived").mkdir()
+    (tmp_path / "derived" / "scenario.toml").write_text('extends = "../base"\nname = "derived"\n')
+    scenario, out = egvs.load(tmp_path / "derived"), tmp_path / "out"
+    egvs.run(scenario, out)
+
+    path = tmp_path / name
+    content = path.read_text() if path.exists() else "newmtl a" if path.suffix == ".mtl" else fcd()
+    path.write_text(content + "\n")
+    assert {stage for stage, state in states(scenario, out).items() if state == "done"} >= CHANGED_FILES[name]
 
 
 @pytest.mark.slow

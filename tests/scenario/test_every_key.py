@@ -18,9 +18,10 @@ import egvs
 from egvs.clouds import simulation as cloud_simulation
 from egvs.placement.plan import solve_placement
 from egvs.runs import stage_keys
+from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
-from egvs.stages.inputs import Inputs, open_folder
+from egvs.stages.inputs import Inputs
 from egvs.studies import what_if
 from tests.conftest import SCENARIO, SITES, collection, feature, write_mini
 

@@ -11,17 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egvs.scoring import standard_errors
-from egvs.scoring.standard_errors import (
-    GROUP_LENGTH_TIMES,
-    MIN_GROUPS,
-    BlockGroups,
-    ScoreUncertainty,
-    group_sizes,
-    summarise_uncertainty,
-    uncertainty_warnings,
-)
-from egvs.statistics import blocks as autocorrelation
+from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty, summarise_uncertainty, uncertainty_warnings
+from egvs.statistics import blocks as block_statistics
+from egvs.statistics.blocks import GROUP_LENGTH_TIMES, MIN_GROUPS, group_sizes
 
 
 def autoregressive_series(records: int, frames: int, keeps: float, seed: int) -> np.ndarray:
@@ -37,7 +29,7 @@ def autoregressive_series(records: int, frames: int, keeps: float, seed: int) ->
 
 @pytest.mark.parametrize("keeps", [0.0, 0.5, 0.9])
 def test_autocorrelation_time_of_autoregressive_series(keeps: float) -> None:
-    found = [autocorrelation.autocorrelation_time(series) for series in autoregressive_series(40, 4000, keeps, 1)]
+    found = [block_statistics.autocorrelation_time(series) for series in autoregressive_series(40, 4000, keeps, 1)]
     assert np.mean(found) == pytest.approx((1 + keeps) / (1 - keeps), rel=0.15)
 
 
@@ -50,25 +42,25 @@ def test_the_sums_by_hand() -> None:
         largest = max(largest, total)
         if lag >= 5 * largest:
             break
-    assert autocorrelation.autocorrelation_time(series) == pytest.approx(largest, abs=1e-3)
+    assert block_statistics.autocorrelation_time(series) == pytest.approx(largest, abs=1e-3)
 
 
 def test_a_periodic_signal_does_not_hide_the_correlation_over_full_cycles() -> None:
     """The plain sum of a swing of 80 frames cancels within half a cycle; the largest one does not."""
     slow = autoregressive_series(20, 4000, 0.9, 2)
     swinging = slow + 1.5 * np.sign(np.sin(2 * np.pi * np.arange(4000) / 80))
-    assert np.mean([autocorrelation.autocorrelation_time(series) for series in swinging]) >= 15
+    assert np.mean([block_statistics.autocorrelation_time(series) for series in swinging]) >= 15
 
 
 @pytest.mark.parametrize("series", [np.zeros(9), np.full(9, 3), np.array([5]), np.array([1, -1] * 20)])
 def test_constant_and_alternating_series_have_no_autocorrelation(series: np.ndarray) -> None:
-    assert autocorrelation.autocorrelation_time(series) == 1.0
+    assert block_statistics.autocorrelation_time(series) == 1.0
 
 
 @given(st.floats(1, 500), st.integers(10, 100_000), st.integers(2, 10))
 def test_errors_are_never_narrowed_and_long_records_are_left_alone(lasts: float, frames: int, groups: int) -> None:
-    assert standard_errors.standard_error_inflation(lasts, frames, groups) >= 1.0
-    assert standard_errors.standard_error_inflation(lasts, int(1000 * lasts * groups), groups) < 1.01
+    assert block_statistics.standard_error_inflation(lasts, frames, groups) >= 1.0
+    assert block_statistics.standard_error_inflation(lasts, int(1000 * lasts * groups), groups) < 1.01
 
 
 @pytest.mark.parametrize(("lasts", "frames", "groups"), [(50, 1000, 10), (50, 2000, 4), (200, 1000, 4), (5, 1000, 10)])
@@ -77,13 +69,13 @@ def test_inflation_equals_that_of_the_covariance(
 ) -> None:
     """Of a series that keeps a share of itself from frame to frame: the variance of its mean, and the scatter of the
     means of groups that is to be expected, entry by entry of the covariance matrix."""
-    monkeypatch.setattr(standard_errors, "_time_upper_bound", lambda time_frames, frames: time_frames)
+    monkeypatch.setattr(block_statistics, "_time_upper_bound", lambda time_frames, frames: time_frames)
     at = np.arange(frames)
     covariance = ((lasts - 1.0) / (lasts + 1.0)) ** np.abs(at[:, None] - at[None, :])
     of_groups = covariance.reshape(groups, frames // groups, groups, frames // groups).mean(axis=(1, 3))
     scatter = (np.trace(of_groups) - of_groups.sum() / groups) / (groups - 1) / groups
     needed = math.sqrt(covariance.mean() / scatter)
-    assert standard_errors.standard_error_inflation(lasts, frames, groups) == pytest.approx(needed, rel=1e-3)
+    assert block_statistics.standard_error_inflation(lasts, frames, groups) == pytest.approx(needed, rel=1e-3)
 
 
 def test_groups_are_longer_than_the_correlation_time_if_the_record_allows() -> None:
@@ -101,7 +93,7 @@ def estimates(series: np.ndarray, blocks: int) -> list[ScoreUncertainty]:
     """Of the means of records (records, frames), as the blocks of a TPOG would give them."""
     found = []
     for one in series:
-        lasts = autocorrelation.autocorrelation_time(one)
+        lasts = block_statistics.autocorrelation_time(one)
         frames = np.array(group_sizes(blocks, len(one) // blocks, lasts)) * (len(one) // blocks)
         sums = np.array([part.sum() for part in np.split(one, np.cumsum(frames)[:-1])])
         left_out = [(one.sum() - part) / (len(one) - n) for part, n in zip(sums, frames, strict=True)]

@@ -12,11 +12,11 @@ import pytest
 import egvs
 from egvs.artefacts import parquet, readers
 from egvs.core.errors import InputError
+from egvs.runs.run_context import open_folder
 from egvs.scenario import loading, model
 from egvs.scoring.target_scores import detection_chances
 from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.stages import scan, score, statics
-from egvs.stages.inputs import open_folder
 from egvs.stages.site_scans import empty_scans
 from egvs.stages.site_scoring import vehicle_spots
 from tests.conftest import SITES, write_mini

@@ -25,13 +25,12 @@ from egvs.scoring.standard_errors import (
     beats_next,
     detector_groups,
     lag_behind_best,
-    means_without_each,
-    standard_error_inflation,
     summarise_uncertainty,
 )
 from egvs.scoring.target_scores import DETECTORS, detectability_features, detectability_model
 from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
+from egvs.statistics.blocks import means_without_each, standard_error_inflation
 
 STEADY = (BlockGroups(np.full(4, 10), 0.0),)
 """Four blocks of traffic."""

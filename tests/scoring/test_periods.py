@@ -21,12 +21,12 @@ from egvs.artefacts.readers import PeriodRanking, read_scores_by_period
 from egvs.artefacts.tpog import read_periods, read_tpog
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
 from egvs.core.grid import Grid
+from egvs.runs.run_context import open_folder
 from egvs.scoring.egvs import EntropyField, binary_entropy
 from egvs.scoring.score_table import ScoreTable, SiteScores
 from egvs.scoring.scorer import SiteScore
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages import score, traffic
-from egvs.stages.inputs import open_folder
 from egvs.studies.effect_study import effect_statuses
 
 PERIODS = """

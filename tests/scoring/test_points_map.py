@@ -150,7 +150,7 @@ def test_maps_of_a_run_are_drawn_and_exported(mini: Path, tmp_path: Path) -> Non
     import egvs
     from egvs.export.export import export_run
     from egvs.placement import plan
-    from egvs.stages.inputs import open_folder
+    from egvs.runs.run_context import open_folder
     from egvs.stages.site_scans import empty_scans
 
     (mini / "roads.net.xml").write_text(NET)

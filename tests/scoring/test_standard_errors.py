@@ -20,13 +20,14 @@ from egvs.cli.run_tables import ranking_table
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
 from egvs.results.ranking import RankedSite
+from egvs.runs.run_context import open_folder
 from egvs.scoring import egvs as scoring_egvs
 from egvs.scoring import standard_errors
 from egvs.scoring.egvs import EntropyField, binary_entropy
 from egvs.scoring.scorer import Scorer
-from egvs.scoring.standard_errors import MIN_GROUPS, BlockGroups, BlockJackknife, ScoreUncertainty, group_sizes
-from egvs.stages.inputs import get_scene, open_folder
+from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages.site_scans import empty_scans
+from egvs.statistics.blocks import MIN_GROUPS, group_sizes
 
 GRID = Grid.from_json({"origin_m": [0.0, 0.0, 0.0], "voxel_m": 1.0, "shape": [6, 5, 2]})
 CELLS = np.arange(60)
@@ -228,7 +229,7 @@ def test_scores_say_how_sure_they_are(mini: Path, tmp_path: Path) -> None:
     leave_out = BlockJackknife.of(tmp_path / "out" / "tpog.parquet", egvs.read_tpog(tmp_path / "out" / "tpog.parquet"))
     assert leave_out is not None
     work, tpog = open_folder(scenario, tmp_path / "out"), egvs.read_tpog(tmp_path / "out" / "tpog.parquet")
-    scorer = Scorer(get_scene(work), tpog, leave_out=leave_out)
+    scorer = Scorer(work.scene, tpog, leave_out=leave_out)
     for scan, row in zip(empty_scans(work), rows, strict=True):
         assert scorer.score(scan.beams).replicates[0] == pytest.approx(row["egvs"], rel=1e-12)
 

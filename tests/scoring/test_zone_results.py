@@ -18,13 +18,13 @@ from egvs.artefacts import readers, traffic_frames
 from egvs.artefacts.readers import ZoneVisibility
 from egvs.core.errors import InputError
 from egvs.formats import georeference
+from egvs.runs.run_context import open_folder
 from egvs.scenario import loading
 from egvs.scoring import zone_results, zones
 from egvs.scoring.target_scores import DETECTORS
 from egvs.scoring.targets import TargetRecord
 from egvs.scoring.zone_results import ZoneUsers
 from egvs.stages import site_scoring
-from egvs.stages.inputs import open_folder
 from egvs.stages.site_scans import empty_scans
 from egvs.traffic.network import Lane, Permission
 from egvs.world.carriageway import Carriageway

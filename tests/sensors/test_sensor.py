@@ -29,7 +29,7 @@ from egvs.sensors.sensor import (
     rotation_world_sensor,
     scenario_sensor,
 )
-from egvs.stages.scene_inputs import site_digests
+from egvs.stages.scene_dependencies import site_digests
 from egvs.world import clearances
 from egvs.world.static_world import GROUND_MARGIN_M
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egvs.statistics import ranks as score_errors
+from egvs.statistics import ranks
 
 
 def test_rank_agreement_best_sites_and_regret_with_ties() -> None:
@@ -13,11 +13,11 @@ def test_rank_agreement_best_sites_and_regret_with_ties() -> None:
     pairs = [(i, j) for i in range(4) for j in range(i)]
     signs = [(np.sign(a[i] - a[j]), np.sign(b[i] - b[j])) for i, j in pairs]
     agree = sum(x * y for x, y in signs) / np.sqrt(sum(x != 0 for x, _ in signs) * sum(y != 0 for _, y in signs))
-    assert score_errors.rank_agreement(a, b, "tau") == pytest.approx(agree)
-    assert score_errors.rank_agreement(np.ones(3), np.ones(3), "rho") == 1.0
-    assert score_errors.rank_agreement(np.ones(4), b, "tau") == 0.0
-    assert score_errors.best_sites(a, 1) == {0, 1}
-    assert score_errors.best_sites(b, 3) == {0, 1, 3}
-    assert score_errors.regret(a, b) == pytest.approx(0.25)  # of two that tie, the worse
-    assert score_errors.regret(b, a) == 0.0
-    assert score_errors.relative_errors(np.array([0.0, 1.0]), np.array([0.0, 0.0])).tolist() == [0.0, np.inf]
+    assert ranks.rank_agreement(a, b, "tau") == pytest.approx(agree)
+    assert ranks.rank_agreement(np.ones(3), np.ones(3), "rho") == 1.0
+    assert ranks.rank_agreement(np.ones(4), b, "tau") == 0.0
+    assert ranks.best_sites(a, 1) == {0, 1}
+    assert ranks.best_sites(b, 3) == {0, 1, 3}
+    assert ranks.regret(a, b) == pytest.approx(0.25)  # of two that tie, the worse
+    assert ranks.regret(b, a) == 0.0
+    assert ranks.relative_errors(np.array([0.0, 1.0]), np.array([0.0, 0.0])).tolist() == [0.0, np.inf]

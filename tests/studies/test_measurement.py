@@ -14,8 +14,8 @@ from egvs.core import files
 from egvs.core.errors import RunError
 from egvs.core.resource_usage import measure_usage
 from egvs.runs import stage_keys, stage_registry
+from egvs.runs.run_context import open_folder
 from egvs.scoring.scorer import Scorer
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.site_scoring import empty_scans
 from egvs.studies import measurement, study_settings
 from egvs.studies.study_settings import SCENARIO_AS_IS
@@ -45,7 +45,7 @@ def test_thinned_beams_score_as_if_each_hit_counted_twice(mini: Path, tmp_path: 
     with np.errstate(divide="ignore", invalid="ignore"):
         entropy = np.nan_to_num(-(p * np.log2(p) + (1 - p) * np.log2(1 - p)))
     work = open_folder(scenario, tmp_path / "out")
-    scorer = Scorer(get_scene(work), tpog)
+    scorer = Scorer(work.scene, tpog)
     for share, scan in zip(thinned_shares, empty_scans(work), strict=True):
         twice = np.minimum(4.0, 2.0 * scorer.hits(scan.beams).ravel())
         assert share == pytest.approx((entropy * twice).sum() / (4.0 * entropy.sum()), rel=1e-12)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import egvs
+from egvs.runs.run_context import open_folder
 from egvs.scoring.target_scores import DETECTORS
-from egvs.stages.inputs import open_folder
 from egvs.studies.traffic_scores import RunScores, Window, detector_score, score_run
 
 WINDOWS = (Window(0, 4), Window(0, 2), Window(2, 2))

@@ -19,7 +19,7 @@ from egvs.core.errors import InputError
 from egvs.results.ranking import RankedSite, Ranking
 from egvs.runs import run
 from egvs.scenario.loading import load
-from egvs.scoring.standard_errors import standard_error_inflation
+from egvs.statistics.blocks import standard_error_inflation
 from egvs.studies import what_if
 from egvs.studies.paired_errors import SiteReplicates, read_replicates
 from egvs.studies.what_if import WhatIfResult, WhatIfRun, compare_runs, grow_trees, prepare_runs, solid_documents

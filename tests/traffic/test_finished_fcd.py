@@ -15,9 +15,9 @@ from egvs.artefacts import parquet
 from egvs.cli import stage_summary
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.runs import stage_keys
+from egvs.runs.run_context import open_folder
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.stages import traffic
-from egvs.stages.inputs import open_folder
 from egvs.studies.study_settings import counted_frames
 from egvs.traffic import finished_fcd
 from egvs.traffic.vehicle_boxes import VehicleSize

@@ -8,7 +8,7 @@ from egvs.core.errors import RunError
 from egvs.core.grid import Roi
 from egvs.stages import traffic
 from egvs.traffic import locks, network, sumo_folder
-from egvs.traffic.locks import DemandKey, RegionWatch, StreetNames, SumoFiles, WatchedRegion
+from egvs.traffic.locks import DemandKey, RegionWatch, StreetNames, WatchedRegion
 from egvs.traffic.sumo_folder import Timing
 from tests.stage_runner import run_stage
 from tests.traffic.helpers import SIZES, netgenerate, scenario
@@ -51,8 +51,8 @@ def rows(seconds, *vehicles):
 
 def watch(tmp_path, roads, regions=None, teleport_s=None):
     timing = Timing(0, 0, 1000, 250, 2000)
-    files = SumoFiles(tmp_path / "fcd.csv", tmp_path / "sumo.log")
-    return RegionWatch(files, timing, regions or {"": WatchedRegion(ROI)}, roads, SIZES, DEMAND, teleport_s)
+    fcd, log = tmp_path / "fcd.csv", tmp_path / "sumo.log"
+    return RegionWatch(fcd, log, timing, regions or {"": WatchedRegion(ROI)}, roads, SIZES, DEMAND, teleport_s)
 
 
 def test_reads_teleports_of_recorded_time():

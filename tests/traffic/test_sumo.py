@@ -69,11 +69,11 @@ def test_programs_use_huge_pages_unless_the_user_sets_other_tunables(tmp_path, m
 
 def test_version_of_another_sumo_is_parsed(tmp_path, monkeypatch):
     fake_sumo(tmp_path, monkeypatch, "echo 'Eclipse SUMO sumo v1_27_0+0045-abc'")
-    sumo._installed_version.cache_clear()
+    sumo.sumo_version.cache_clear()
     try:
         assert sumo.sumo_version() == "1.27.0+0045-abc"
     finally:
-        sumo._installed_version.cache_clear()
+        sumo.sumo_version.cache_clear()
 
 
 def test_rejects_incomplete_network_from_netconvert(tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import trimesh
 from egvs.core.errors import InputError
 from egvs.scenario import loading
 from egvs.sensors.scanner import Scanner
-from egvs.stages import inputs
+from egvs.stages import scene_inputs
 from egvs.world import static_world
 from tests.conftest import collection
 from tests.world.static_worlds import BOX, COURT, FRAME, HOLE, SQUARE, build_located, build_mesh, load, polygon, volumes
@@ -118,7 +118,7 @@ def check_sites_at(folder, *sites, features, ground=True):
 
 def check_sites(loaded, world):
     """The scene, once all of its sites are checked."""
-    scene = inputs.resolve_scene(loaded, world)
+    scene = scene_inputs.resolve_scene(loaded, world)
     Scanner(scene).check(scene.sites)
     return scene
 

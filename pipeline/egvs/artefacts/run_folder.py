@@ -16,9 +16,6 @@ STAGE_NAMES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
 RUNS = Path("runs")
 """The folder of all runs for which no other is given."""
 
-UNCHANGED_PATTERN = ".unchanged-*.json"
-"""Names of what runs printed (:mod:`egvs.runs.unchanged`); a hash of the command takes the place of the star."""
-
 
 @dataclass(frozen=True)
 class RunFile:

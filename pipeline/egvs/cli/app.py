@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
@@ -33,11 +32,9 @@ from egvs.cli.options import (
     Top,
     Verbose,
 )
-from egvs.cli.quick_help import QuickHelpCommand
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
-    from egvs.cli import repeat
     from egvs.scenario.model import Scenario
     from egvs.studies.effect_study import EffectStatus
 
@@ -85,8 +82,6 @@ def _load(path: Path, overrides: Sequence[str] | None, out: Path | None) -> tupl
 
 # ---- a run and its stages
 
-NO_STAGE_RAN = "no stage ran: no input has changed since the last run"
-
 
 @app.command()
 def run(
@@ -102,57 +97,29 @@ def run(
     rehash: Rehash = False,
 ) -> None:
     """Run all stages in order and print the best poles; stages with unchanged inputs are skipped."""
-    from egvs.cli import repeat
-
-    overrides = cli_options.with_detector(set_, detector)
-
-    def run_all() -> repeat.FinishedRun:
-        poles = None if all_ else top
-        return _run_all_stages(scenario, out, overrides, jobs, audit=audit, poles=poles, verbose=verbose, rehash=rehash)
-
-    if audit or rehash:
-        run_all()
-        return
-    arguments = ["run", str(scenario), str(out), *overrides, str(top), str(all_), str(verbose)]
-    repeat.print_or_run(arguments, out, run_all)
-
-
-def _run_all_stages(
-    path: Path,
-    out: Path | None,
-    overrides: Sequence[str] | None,
-    jobs: int | None,
-    *,
-    audit: bool,
-    poles: int | None,
-    verbose: bool,
-    rehash: bool,
-) -> repeat.FinishedRun:
-    """Run all stages and print the results; ``poles`` is the number of poles in the answer, None for all."""
-    from egvs.cli.console import ProgressDisplay, skipped_stages_text
+    from egvs.cli.console import ProgressDisplay
 
     stage_options = {"score": {"audit": True}} if audit else None
     with ProgressDisplay("run", with_details=verbose) as screen:
-        from egvs.cli import answer, repeat, run_tables
-        from egvs.runs import digest_cache, run
+        from egvs.cli import answer, run_tables
+        from egvs.runs import digest_cache
+        from egvs.runs.run import run
 
-        loaded, folder = _load(path, overrides, out)
+        loaded, folder = _load(scenario, cli_options.with_detector(set_, detector), out)
         screen.flow_source = answer.flow_source(loaded)
         if rehash:
             digest_cache.forget_digests(folder)
-        record = run.run(
+        record = run(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
     if not screen.any_stage_ran:
-        screen.say(NO_STAGE_RAN)
-    if poles is None:
+        screen.say("no stage ran: no input has changed since the last run")
+    if all_:
         run_tables.print_scores(folder, record, before_answer=True)
     if verbose:
         run_tables.print_costs(folder, record)
     run_tables.print_audit(record)
-    answer.print_answer(folder, loaded, record, poles=poles)
-    text = skipped_stages_text(record, with_details=verbose, flow_source=screen.flow_source)
-    return repeat.FinishedRun(folder, record, f"{text}{NO_STAGE_RAN}\n")
+    answer.print_answer(folder, loaded, record, poles=None if all_ else top)
 
 
 @app.command()
@@ -796,7 +763,7 @@ def new(
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario, notes)
     if run_:
-        _run_all_stages(folder, None, None, None, audit=False, poles=DEFAULT_POLES, verbose=False, rehash=False)
+        run(folder)
 
 
 @app.command()
@@ -863,8 +830,6 @@ def _group_commands() -> None:
     app.registered_commands.sort(key=lambda info: order.index(command_name(info)))
     for command in app.registered_commands:
         command.rich_help_panel = panel_of[command_name(command)]
-        if command.cls is TyperCommand:
-            command.cls = QuickHelpCommand
 
 
 _group_commands()

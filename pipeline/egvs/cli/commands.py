@@ -12,9 +12,8 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
-from egvs.cli.quick_help import QuickHelpCommand, QuickHelpGroup
 from egvs.core import plugins
 from egvs.core.errors import MissingBackendError
 
@@ -56,7 +55,7 @@ class Command(NamedTuple):
     app: typer.Typer | Callable[..., None]
 
 
-class ExtensibleGroup(QuickHelpGroup):
+class ExtensibleGroup(TyperGroup):
     """The commands of the core, and those of extensions once they are needed."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
@@ -108,5 +107,5 @@ def extension_commands(extension: str) -> dict[str, TyperCommand]:
         if isinstance(command.app, typer.Typer):
             holder.add_typer(command.app, name=command.name, rich_help_panel=command.panel)
         else:
-            holder.command(command.name, cls=QuickHelpCommand, rich_help_panel=command.panel)(command.app)
+            holder.command(command.name, rich_help_panel=command.panel)(command.app)
     return dict(typer.main.get_group(holder).commands)

@@ -1,24 +1,24 @@
-"""What all output of the command line shares: the console, tables, values as text, and the progress display.
+"""What all output of the command line shares: the console, tables, and the progress display.
 
 Results go to standard output; progress, stage lines and warnings go to standard error.
 """
 
 from __future__ import annotations
 
-import io
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, Generic, Literal, TextIO, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from egvs.artefacts.run_record import RunRecord, StageRecord
+from egvs.artefacts.run_record import StageRecord
 from egvs.cli import stage_summary
+from egvs.cli.value_text import format_value, format_values
 from egvs.core.errors import collect_warnings
 from egvs.core.wording import format_percent
 
@@ -119,15 +119,6 @@ def print_table(columns: Sequence[Column[Row]], rows: Iterable[Row], *, file_wid
     out.print(make_table(columns, rows, width=out.width))
 
 
-def format_values(values: Mapping[str, Any]) -> str:
-    """Return the entries of a mapping in one line, without empty ones."""
-    shown = []
-    for key, value in values.items():
-        if value not in ("", [], {}, None):
-            shown.append(f"{key.replace('_', ' ')} {format_value(value)}")
-    return "; ".join(shown)
-
-
 def format_or_dash(value: float | None, spec: str) -> str:
     """Return a number as text, with a format such as ".2f"; "-" if it is unknown."""
     if value is None:
@@ -148,23 +139,6 @@ def print_mapping(values: Mapping[str, Any], file_width: int) -> None:
         if isinstance(value, dict):
             text = format_values(value)
         out.print(f"{key}: {text}")
-
-
-def format_value(value: Any) -> str:
-    """Return a value as text; a mapping of counts as "3 pole, 2 sign"."""
-    if isinstance(value, dict):
-        return ", ".join(_format_entry(str(key).replace("_", " "), entry) for key, entry in value.items())
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, list | tuple):
-        return ", ".join(format_value(entry) for entry in value)
-    return str(value)
-
-
-def _format_entry(key: str, value: Any) -> str:
-    if isinstance(value, dict):
-        return f"{key} ({format_value(value)})"
-    return f"{format_value(value)} {key}"
 
 
 class _ElapsedColumn(ProgressColumn):
@@ -192,8 +166,6 @@ class ProgressDisplay:
     with_details
         Whether all that a stage reports is printed, and every warning; otherwise one short line for each stage, and the
         first :data:`MAX_WARNINGS` warnings.
-    file
-        Where lines are printed, without a bar; standard error when None.
 
     Attributes
     ----------
@@ -205,7 +177,7 @@ class ProgressDisplay:
         What the simulated flows are compared with; set by commands that know the scenario.
     """
 
-    def __init__(self, verb: str = "", *, with_details: bool = False, file: TextIO | None = None) -> None:
+    def __init__(self, verb: str = "", *, with_details: bool = False) -> None:
         self.any_stage_ran = False
         self.hidden_warnings = 0
         self.flow_source = stage_summary.FLOWS
@@ -215,9 +187,7 @@ class ProgressDisplay:
         self._part = ""
         self._part_seconds = 0.0
         self._part_states: set[str] = set()
-        self._console = Console(
-            file=file, stderr=file is None, highlight=False, markup=False, emoji=False, soft_wrap=True
-        )
+        self._console = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),  # names may have brackets
             BarColumn(),
@@ -226,7 +196,7 @@ class ProgressDisplay:
             transient=True,
         )
         self._task = self._bar.add_task(verb, total=None)
-        self._has_bar = file is None and sys.stderr.isatty()
+        self._has_bar = sys.stderr.isatty()
 
     def __enter__(self) -> ProgressDisplay:
         if self._has_bar:
@@ -319,21 +289,3 @@ class ProgressDisplay:
     def say(self, line: str) -> None:
         """Print a line above the bar."""
         self._console.print(line)
-
-
-def skipped_stages_text(record: RunRecord, *, with_details: bool, flow_source: str) -> str:
-    """Return what a :class:`ProgressDisplay` prints when all stages of a record are skipped.
-
-    Parameters
-    ----------
-    record
-        A complete run.
-    with_details, flow_source
-        As of the display.
-    """
-    text = io.StringIO()
-    with ProgressDisplay("run", with_details=with_details, file=text) as screen:
-        screen.flow_source = flow_source
-        for stage, stage_record in record.stages.items():
-            screen.stage_event(stage, "skipped", stage_record)
-    return text.getvalue()

@@ -18,7 +18,6 @@ from egvs.creation.new_scenario import NewScenario
 from egvs.creation.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
 from egvs.extensions.tracks.new import files as recorded_traffic
 from egvs.extensions.tracks.recorded_tracks import track_warnings
-from egvs.traffic.estimates import MIN_OBSERVATIONS
 
 if TYPE_CHECKING:
     from egvs.creation.assumed_traffic import AssumedTraffic
@@ -153,6 +152,8 @@ def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
 
 def _demand_warnings(scenario: NewScenario, demand: TrackDemand) -> Iterator[str]:
     """Warn about counts from few vehicles, and about tracks beside the lanes."""
+    from egvs.statistics.intervals import MIN_OBSERVATIONS  # loads scipy.stats
+
     where = scenario.folder / "scenario.toml"
     if demand.marked:
         yield (

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
+from typer.core import TyperCommand
 
-from egvs.cli.quick_help import QuickHelpCommand
 from egvs.core.errors import InputError
 
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario folder, or its scenario.toml.")]
@@ -188,7 +188,7 @@ def pole_spacing_m(rule: str, spacing: str) -> float:
     return spacing_m
 
 
-class PolesCommand(QuickHelpCommand):
+class PolesCommand(TyperCommand):
     """A command that accepts ``--poles 20m`` and ``--poles "every 20m"`` for ``--poles every 20m``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from egvs.cli.value_text import format_value
 from egvs.core.wording import by_number, list_first
 
 if TYPE_CHECKING:
@@ -99,7 +100,6 @@ def _describe_differences(differences: dict[str, tuple[Any, Any]]) -> str:
 
 def format_setting(key: str, value: Any) -> str:
     """Return a setting as text: an effect without other parameters as "on" or "off", an empty value as "none"."""
-    from egvs.cli.console import format_value
     from egvs.runs.run_names import effect_state
 
     if state := effect_state(key, value):

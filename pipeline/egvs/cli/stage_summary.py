@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 from egvs.artefacts.run_record import StageRecord
+from egvs.cli.value_text import format_values
 from egvs.core.errors import WARNINGS_KEY
 from egvs.core.wording import format_percent, number_of
 from egvs.results.labels import SCORE_LABELS
@@ -90,8 +91,6 @@ def stage_lines(
 
 def describe_summary(stage: str, summary: dict[str, Any], *, with_details: bool, flow_source: str = FLOWS) -> str:
     """Return the summary of a stage in one line; see :func:`stage_lines`."""
-    from egvs.cli.console import format_values
-
     rest = {key: value for key, value in summary.items() if key not in _OMITTED_KEYS}
     sentences: list[Sentence] = []
     if stage in _SENTENCES and _REQUIRED_KEYS[stage] <= summary.keys():

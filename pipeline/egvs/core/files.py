@@ -1,6 +1,4 @@
-"""Input files held in memory, atomic writing, temporary folders, hashes, and JSON records with a checksum.
-
-During a run (:func:`hold_inputs`), :func:`open_input` reads each input file from the disk once.
+"""Atomic writing, temporary folders, hashes, and JSON records with a checksum.
 
 A file is first written to ``.<name>.partial``, then renamed, so that a killed run leaves no half-written artefact.
 Temporary folders are locked while they are in use, so that the next program removes those of a killed one.
@@ -13,20 +11,16 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import io
 import json
 import math
 import os
 import shutil
-import stat
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from contextvars import ContextVar
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from egvs.core import platform
 from egvs.core.errors import InputError
@@ -84,12 +78,6 @@ def temporary_folder() -> Iterator[Path]:
                 if lock is not None:  # None on a file system without locks
                     os.close(lock)
             return
-
-
-def is_temporary(path: Path) -> bool:
-    """Return whether a file is, or was, in a folder of :func:`temporary_folder`."""
-    parent = Path(tempfile.gettempdir())
-    return any(folder.parent == parent and folder.name.startswith(_TEMP_PREFIX) for folder in path.parents)
 
 
 @cache
@@ -166,145 +154,11 @@ def write_text(path: Path, text: str) -> None:
 
 
 def hash_file(path: Path) -> str:
-    """Return the SHA-256 hex digest of a file; InputError when it does not exist.
-
-    An input that :func:`open_input` holds in memory is not opened again, nor one whose digest is known
-    (:func:`use_digests`).
-    """
-    if not is_input_file(path):
+    """Return the SHA-256 hex digest of a file as it is now; InputError when it does not exist."""
+    if not path.is_file():
         raise InputError(path, "no such file", f"Run the stage that writes {path.name} first.")
-    known = _KNOWN_DIGEST.get()
-    digest = _hash_content(path) if known is None else known(path, _hash_content)
-    tell_observers(path, digest)
-    return digest
-
-
-def is_input_file(path: Path) -> bool:
-    """Return whether a file exists that an input names or that may accompany one."""
-    exists = path.is_file()
-    tell_observers(path, PRESENT if exists else ABSENT)
-    return exists
-
-
-def _hash_content(path: Path) -> str:
-    held = _HELD_FILES.get()
-    content = None if held is None else held.contents.get(_file_stamp(path))
-    if content is not None:
-        return hashlib.sha256(content).hexdigest()
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-_KNOWN_DIGEST: ContextVar[Callable[[Path, Callable[[Path], str]], str] | None] = ContextVar(
-    "_KNOWN_DIGEST", default=None
-)
-
-
-@contextmanager
-def use_digests(digest: Callable[[Path, Callable[[Path], str]], str]) -> Iterator[None]:
-    """Let a function return the digests of :func:`hash_file` within the block: of a path, and how to hash its file."""
-    token = _KNOWN_DIGEST.set(digest)
-    try:
-        yield
-    finally:
-        _KNOWN_DIGEST.reset(token)
-
-
-FileObserver = Callable[[Path | None, str], None]
-"""Called with each input file that is looked for, opened or hashed, and its sha256, :data:`PRESENT` or :data:`ABSENT`;
-without a file where something is used that no file tells."""
-
-PRESENT, ABSENT = "present", "absent"
-
-_OBSERVERS: list[FileObserver] = []
-"""For the whole process, whichever thread reads a file."""
-
-
-@contextmanager
-def observe_files(observer: FileObserver) -> Iterator[None]:
-    """Call a function with each input file that is used within the block."""
-    _OBSERVERS.append(observer)
-    try:
-        yield
-    finally:
-        _OBSERVERS.remove(observer)
-
-
-def tell_observers(path: Path | None, state: str = "") -> None:
-    """Call all observers; see :data:`FileObserver`."""
-    for observer in _OBSERVERS:
-        observer(path, state)
-
-
-_MAX_HELD_BYTES = 128_000_000
-"""Size of all files together that are held in memory."""
-
-
-class _FileStamp(NamedTuple):
-    """Changes when a file is written."""
-
-    real_path: Path
-    is_regular: bool
-    mtime_ns: int
-    inode: int
-    size: int
-
-
-def _file_stamp(path: Path) -> _FileStamp:
-    status = path.stat()
-    real_path = Path(os.path.realpath(path))
-    return _FileStamp(real_path, stat.S_ISREG(status.st_mode), status.st_mtime_ns, status.st_ino, status.st_size)
-
-
-@dataclass
-class _HeldFiles:
-    """Contents of input files."""
-
-    except_in: Path
-    contents: dict[_FileStamp, bytes] = field(default_factory=dict)
-    size: int = 0
-
-
-_HELD_FILES: ContextVar[_HeldFiles | None] = ContextVar("_HELD_FILES", default=None)
-
-
-@contextmanager
-def hold_inputs(*, except_in: Path) -> Iterator[None]:
-    """Read each input file once: within the block, :func:`open_input` holds what it has read in memory.
-
-    So the content that is hashed is the content that is parsed. Files in the folder ``except_in``, which a run writes,
-    and files that do not fit into :data:`_MAX_HELD_BYTES` are read each time.
-    """
-    token = _HELD_FILES.set(_HeldFiles(Path(os.path.realpath(except_in))))
-    try:
-        yield
-    finally:
-        _HELD_FILES.reset(token)
-
-
-def open_input(path: Path) -> io.BufferedReader | io.BytesIO:
-    """Open a file to read its bytes; from memory, where :func:`hold_inputs` holds it."""
-    held = _HELD_FILES.get()
-    if held is None:
-        observe_content(path)
-        return path.open("rb")
-    stamp = _file_stamp(path)
-    if stamp.real_path.is_relative_to(held.except_in):
-        return path.open("rb")
-    if stamp not in held.contents and stamp.is_regular and held.size + stamp.size <= _MAX_HELD_BYTES:
-        held.contents[stamp] = path.read_bytes()
-        held.size += stamp.size
-    observe_content(path)
-    content = held.contents.get(stamp)
-    return path.open("rb") if content is None else io.BytesIO(content)
-
-
-def observe_content(path: Path) -> None:
-    """Tell observers the digest of a file that is opened."""
-    if _OBSERVERS and path.is_file():
-        hash_file(path)
-    else:
-        tell_observers(None)  # a pipe, for example
 
 
 def hash_json(value: Any) -> str:

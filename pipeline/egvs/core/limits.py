@@ -11,7 +11,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from egvs.core import files
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 
 MB = 1_000_000
@@ -107,7 +107,7 @@ def read_bytes(path: Path, limit: Limit, where: object = "") -> bytes:
     """Return the content of a file; InputError when it exceeds a limit in MB, or cannot be read."""
     checked_size(path, limit, where)
     try:
-        with files.open_input(path) as file:
+        with open_input(path) as file:
             return file.read()
     except OSError as error:
         raise _unreadable_error(where or path, error) from None

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egvs.core import files, plugins
+from egvs.core import plugins
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.creation.map_parts import HEAD_BYTES, MapReader
 
@@ -142,7 +143,7 @@ def read_head(path: Path) -> bytes:
     if not path.is_file():
         raise InputError(path, "no such file", "Check the path.")
     try:
-        with files.open_input(path) as content:
+        with open_input(path) as content:
             head: bytes = content.read(HEAD_BYTES)
     except OSError as error:
         problem = f"the file cannot be read ({error.strerror or error})"
@@ -150,7 +151,7 @@ def read_head(path: Path) -> bytes:
     if not head.startswith(_GZIP):
         return head
     try:
-        with files.open_input(path) as content, gzip.open(content) as unzipped:
+        with open_input(path) as content, gzip.open(content) as unzipped:
             return unzipped.read(HEAD_BYTES)
     except (EOFError, OSError, zlib.error):  # damaged: its reader says so
         return head

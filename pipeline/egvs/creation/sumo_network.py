@@ -6,7 +6,7 @@ import gzip
 import re
 from pathlib import Path
 
-from egvs.core import files
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.creation.map_parts import RoadMap, RoadOptions
 from egvs.traffic import network
@@ -47,7 +47,7 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
 
 
 def _read_text(path: Path) -> str:
-    with files.open_input(path) as content:
+    with open_input(path) as content:
         data = content.read()
     if data.startswith(_GZIP):
         data = gzip.decompress(data)  # its size was checked when the network was read

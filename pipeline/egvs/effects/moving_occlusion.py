@@ -38,7 +38,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,16 +171,6 @@ class Replay:
         return FacingBoxes(self, (facing[:count], block[:count], box[:count], starts, members))
 
 
-class _BeamArrays(NamedTuple):
-    """Beams as :func:`egvs.kernels.occlusion.beam_stops` takes them, (n,) or (n, 3) float64."""
-
-    rise: FloatArray
-    run_m: FloatArray
-    length_per_run: FloatArray
-    direction: FloatArray
-    length_m: FloatArray
-
-
 @dataclass(frozen=True, eq=False)
 class FacingBoxes:
     """Replayed boxes as one sensor sees them; the arrays are those of :func:`egvs.kernels.occlusion.beam_stops`."""
@@ -204,7 +194,7 @@ class FacingBoxes:
         length_m = np.hypot(run_m, ends_m[:, 2])
         azimuth = np.arctan2(ends_m[:, 1], ends_m[:, 0])
         with np.errstate(divide="ignore", invalid="ignore"):  # beams that are vertical, or have no length
-            beams = _BeamArrays(ends_m[:, 2] / run_m, run_m, length_m / run_m, ends_m / length_m[:, None], length_m)
+            beams = (ends_m[:, 2] / run_m, run_m, length_m / run_m, ends_m / length_m[:, None], length_m)
         rows = np.argsort(azimuth)
         azimuth = azimuth[rows]
         frames = (self.replay.first_frame, self.replay.frame)
@@ -217,7 +207,7 @@ class FacingBoxes:
             range_m = np.empty(capacity)
             share = np.empty(capacity)
             count = occlusion.beam_stops(
-                done, rows, azimuth, tuple(beams), self.boxes, frames, shares, met, first, range_m, share
+                done, rows, azimuth, beams, self.boxes, frames, shares, met, first, range_m, share
             )
             total = first[count]
             yield TransmittanceSteps(rows[done : done + count], first[: count + 1], range_m[:total], share[:total])

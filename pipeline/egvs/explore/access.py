@@ -54,7 +54,10 @@ class AccessGuard:
 
     @contextmanager
     def protect_new_servers(self) -> Iterator[None]:
-        """Protect every websocket server that is started inside the ``with`` block."""
+        """Protect every websocket server that is started inside the ``with`` block.
+
+        This replaces a function of ``websockets``, because viser has no option for a check of requests.
+        """
         original = websockets.asyncio.server.serve
 
         def serve(*args: Any, process_request: RequestHandler, **options: Any) -> Any:

@@ -269,11 +269,12 @@ class SceneMeshes:
         scene.configure_default_lights(cast_shadow=False)  # too slow without a graphics card
         meshes = solid_meshes(session.scene.world, zero_m)
         drawn = sum(len(mesh.faces) for mesh in meshes.values())
-        if session.carriageway is not None:
-            meshes["junctions"] = junction_mesh(session.carriageway, zero_m)
-            meshes["lanes"] = lane_mesh(session.carriageway, zero_m)
-        if session.network is not None:
-            meshes["markings"] = marking_mesh(session.network, zero_m)
+        roads = session.work.inputs
+        if roads.carriageway is not None:
+            meshes["junctions"] = junction_mesh(roads.carriageway, zero_m)
+            meshes["lanes"] = lane_mesh(roads.carriageway, zero_m)
+        if roads.network is not None:
+            meshes["markings"] = marking_mesh(roads.network, zero_m)
         scene.add_line_segments("/roi", region_edges(session.scene.roi, zero_m), _ROI_COLOUR, thickness=0.15)
         handles = {}
         for kind, mesh in meshes.items():

@@ -13,8 +13,6 @@ from egvs.explore.access import AccessGuard
 HOST = "127.0.0.1"
 """The page cannot be reached from other machines."""
 
-_SHUTDOWN_S = 5.0
-
 
 class _Server(viser.ViserServer):
     """A server whose page cannot be published."""
@@ -48,9 +46,6 @@ def start_server(guard: AccessGuard, port: int = 0) -> viser.ViserServer:
 
 
 def stop_server(server: viser.ViserServer) -> None:
-    """Stop a server, and wait for its thread."""
-    with redirect_stdout(io.StringIO()):  # viser prints a message at the end of its thread
+    """Stop a server and its threads."""
+    with redirect_stdout(io.StringIO()):  # viser prints a message
         server.stop()
-        thread = server._websock_server._server_thread
-        if thread is not None:
-            thread.join(_SHUTDOWN_S)

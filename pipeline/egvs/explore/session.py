@@ -12,7 +12,6 @@ Nothing here depends on a page or a browser. World frame, metres.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -42,7 +41,7 @@ from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring import blindspots
 from egvs.scoring.blindspots import CELL_M, SpotVisibility, VehicleSpots
 from egvs.scoring.egvs import EntropyField
-from egvs.scoring.points_map import PointsMap
+from egvs.scoring.points_map import PointsMap, TargetPositions
 from egvs.scoring.scorer import PeriodTpog, Scorer
 from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.scoring.targets import SEEN_WELL_POINTS, detection_probability, visible_targets
@@ -51,14 +50,11 @@ from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose, Site
-from egvs.stages import inputs, scene_checks
+from egvs.stages import scene_checks, scene_inputs
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import CheckInputs, get_scene
+from egvs.stages.inputs import CheckInputs
 from egvs.stages.points_maps import target_positions
 from egvs.stages.site_scoring import TargetScorer
-from egvs.traffic import sumo_folder
-from egvs.traffic.network import Network
-from egvs.world.carriageway import Carriageway
 
 Floats = NDArray[np.float64]
 
@@ -70,7 +66,6 @@ def _score_text(name: str, value: float) -> str:
 
 
 _SCORES = RunFolder.scores.name
-_RECORDED = (RunFolder.trajectories.name, RunFolder.tpog.name)
 
 _PLAN_STAGES = ("statics", "scan", "traffic", "tpog")
 """Stages that a plan depends on."""
@@ -100,7 +95,7 @@ class MovingPlan:
         if any(metadata["stages"].get(name) != stages.get(name) for name in _PLAN_STAGES):
             return None
         plan = cls.of_candidates(work, [row["site"] for row in rows])
-        scanner = Scanner(replace(get_scene(work), sites=()))
+        scanner = Scanner(replace(work.scene, sites=()))
         for row, site in zip(rows, plan.poses.sites, strict=True):
             pose = Pose(**{field.name: row[field.name] for field in fields(Pose)})
             if pose != site.pose:  # after --refine
@@ -119,8 +114,8 @@ class MovingPlan:
         names
             Names of the candidates.
         """
-        unconstrained = copy(work)  # sensors may be moved anywhere, whatever [placement] requires
-        unconstrained.scenario = work.scenario.model_copy(update={"placement": type(work.scenario.placement)()})
+        anywhere = type(work.scenario.placement)()  # sensors may be moved, whatever [placement] requires
+        unconstrained = work.with_scenario(work.scenario.model_copy(update={"placement": anywhere}))
         problem = problem_builder.build_problem(unconstrained, lambda _: None)
         indices = [problem.names.index(name) for name in names]
         return cls(PlanPoses.of(unconstrained.scenario, problem, indices))
@@ -208,6 +203,34 @@ class Engine:
     scorer: Scorer
 
 
+class _RecordedVehicles:
+    """The vehicles of the recorded frames, read when they are first needed."""
+
+    def __init__(self, work: StageContext, grid: Grid) -> None:
+        self._work, self._grid = work, grid
+
+    @cached_property
+    def scorer(self) -> TargetScorer:
+        """Scores visible vehicles, without blind spots, which take time for every pose but change no score."""
+        return self._make_scorer(blindspots=False)
+
+    @cached_property
+    def spot_scorer(self) -> TargetScorer:
+        """Scores visible vehicles, with blind spots."""
+        return self._make_scorer(blindspots=True)
+
+    @cached_property
+    def positions(self) -> tuple[TargetPositions, ...]:
+        """Where the standard targets stand."""
+        return target_positions(self._work, self._grid)
+
+    def _make_scorer(self, *, blindspots: bool) -> TargetScorer:
+        self._work.digests(RunFolder.trajectories.name, RunFolder.tpog.name)  # InputError if they were altered
+        score = self._work.scenario.score.model_copy(update={"blindspots": blindspots})
+        scenario = self._work.scenario.model_copy(update={"score": score})
+        return TargetScorer(self._work.with_scenario(scenario), self._grid)
+
+
 class Session:
     """A run that is explored; it changes nothing in the run folder.
 
@@ -219,6 +242,8 @@ class Session:
         Keys of the stages; a plan is read only if it belongs to them.
     period
         Scores are those of this traffic period; empty for all periods together.
+    recorded
+        What the sessions of all periods share.
 
     Attributes
     ----------
@@ -228,18 +253,25 @@ class Session:
         Cached scanners and scorers, by the names of the active effects.
     """
 
-    def __init__(self, work: StageContext, stages: Mapping[str, str], period: str = "") -> None:
+    def __init__(
+        self,
+        work: StageContext,
+        stages: Mapping[str, str],
+        period: str = "",
+        recorded: _RecordedVehicles | None = None,
+    ) -> None:
         self.work, self._stages, self.period = work, stages, period
         self.scenario: Scenario = work.scenario
-        self.scene: Scene = get_scene(work)
+        self.scene: Scene = work.scene
         self.periods: tuple[str, ...] = tuple(entry.name for entry in read_periods(work.folder.tpog) if entry.name)
         self.tpog: Tpog = read_tpog(work.folder.tpog, period or None)
+        self._recorded = recorded or _RecordedVehicles(work, self.tpog.grid)
         self.candidates: dict[str, PoseScore] = self._read_candidates()
         self.engines: dict[tuple[str, ...], Engine] = {}
 
     def in_period(self, period: str) -> Session:
         """Return the same run in one period, or in all periods for an empty name."""
-        return Session(self.work, self._stages, period)
+        return Session(self.work, self._stages, period, self._recorded)
 
     def clear_caches(self) -> None:
         """Free the memory of scanners and scorers; they are made again when needed."""
@@ -265,22 +297,6 @@ class Session:
     def ranked(self) -> list[PoseScore]:
         """The candidates, best first."""
         return sorted(self.candidates.values(), key=lambda candidate: candidate.rank)
-
-    @property
-    def network(self) -> Network | None:
-        """The street network, if the scenario has one."""
-        return self.work.remember("explored roads", (), lambda: sumo_folder.read_network(self.scenario))
-
-    @property
-    def carriageway(self) -> Carriageway | None:
-        """The lanes for vehicles, if the scenario has any."""
-        return self.work.remember("explored lanes", (), self._make_carriageway)
-
-    def _make_carriageway(self) -> Carriageway | None:
-        if self.network is None:
-            return None
-        carriageway = Carriageway.of(self.network)
-        return carriageway if carriageway.lanes else None
 
     def rate(self, name: str, pose: Pose, sensor: str | None = None) -> PoseScore:
         """Score a candidate's sensor, or another one, in a pose.
@@ -358,8 +374,7 @@ class Session:
 
     def blindspots(self, site: Site) -> SiteBlindspots:
         """Return where a sensor misses vehicles, over all periods; see ``blindspots.parquet``."""
-        work = _with_blindspots(self.work, True)
-        targets = self.work.remember("targets at places", _RECORDED, lambda: TargetScorer(work, self.tpog.grid))
+        targets = self._recorded.spot_scorer
         assert targets.spots is not None
         beams = self.beams(site)
         probability = detection_probability(self.scene_with(site), beams.sensor)
@@ -382,8 +397,7 @@ class Session:
         PointsMap, or None
             None where the traffic does not come from one road network.
         """
-        positions = self.work.remember("target positions", (), lambda: target_positions(self.work, self.tpog.grid))
-        for place in positions:
+        for place in self._recorded.positions:
             if place.target.name == target:
                 beams = self.beams(site)
                 return place.points_map(beams, detection_probability(self.scene_with(site), beams.sensor))
@@ -416,25 +430,25 @@ class Session:
             candidates[site.name] = PoseScore(site, {name: row[name] for name in names}, row["rank"])
         return candidates
 
-    @cached_property
+    @property
     def _targets(self) -> TargetScorer | None:
         """Scores visible vehicles; None if the scenario requests no such score."""
         if not any(name in TARGET_SCORES for name in self.scenario.score.additional):
             return None
-        work = _with_blindspots(self.work, False)
-        return self.work.remember("targets", _RECORDED, lambda: TargetScorer(work, self.tpog.grid))
+        return self._recorded.scorer
 
     def _check(self, site: Site) -> tuple[Diagnostic, ...]:
         """Apply the rules for sites; ``only_free`` is off, because it drops sites instead of reporting them."""
         sites_config = self.scenario.sites.model_copy(update={"only_free": False})
         scenario = self.scenario.model_copy(update={"sites": sites_config})
-        checked = CheckInputs(scenario, self.network, self.carriageway, self.scene.world, (site,), self.scene)
+        roads = self.work.inputs
+        checked = CheckInputs(scenario, roads.network, roads.carriageway, self.scene.world, (site,), self.scene)
         return (*scene_checks.check_poses(checked), *scene_checks.warn_sites_on_lanes(checked))
 
     def _engine(self, site: Site) -> Engine:
         """Return scanner and scorer with the effects that act when a candidate is moved to ``site``."""
         sites = tuple(site if other.name == site.name else other for other in self.scene.sites)
-        scene = inputs.with_effects(replace(self.scene, sites=sites, effects=(), inactive_effects=()))
+        scene = scene_inputs.with_effects(replace(self.scene, sites=sites, effects=(), inactive_effects=()))
         key = tuple(effect.NAME for effect in scene.effects)
         if key not in self.engines:
             scene = replace(scene, sites=())  # one scanner for all poses
@@ -474,14 +488,6 @@ class Session:
         if self.period:
             return {**scores, **target_scores.by_period[self.periods.index(self.period)]}
         return scores | {name: float(values[0]) for name, values in target_scores.scores.items()}
-
-
-def _with_blindspots(work: StageContext, enabled: bool) -> StageContext:
-    """Return the same run with or without blind spots, which take time for every pose but change no score."""
-    score = work.scenario.score.model_copy(update={"blindspots": enabled})
-    other = copy(work)
-    other.scenario = work.scenario.model_copy(update={"score": score})
-    return other
 
 
 def site_blindspots(site: str, spots: VehicleSpots, visibility: SpotVisibility, grid: Grid) -> SiteBlindspots:

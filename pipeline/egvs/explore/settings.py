@@ -19,10 +19,10 @@ from egvs.effects import registry
 from egvs.explore.session import Session
 from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
+from egvs.runs.run_context import open_folder
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
-from egvs.stages.inputs import open_folder
 from egvs.studies import effect_study
 
 REQUIRED_STAGES = ("check", "statics", "scan", "traffic", "tpog", "score")

@@ -114,7 +114,7 @@ def write_dxf(path: Path, run: FinishedRun, layers: Sequence[Layer], reference: 
     list of str
         Notes on what was left out.
     """
-    from ezdxf._options import options
+    from ezdxf import options  # type: ignore[attr-defined]  # documented, but not in an __all__
     from ezdxf.filemanagement import new
 
     by_name = {layer.name: layer for layer in layers}

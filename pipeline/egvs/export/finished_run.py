@@ -22,12 +22,12 @@ from egvs.core.errors import InputError
 from egvs.formats import georeference
 from egvs.formats.georeference import WorldFrame
 from egvs.runs import stage_registry
+from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
 from egvs.scoring.scorer import Scorer
 from egvs.stages import score
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.world import geolocation
 
 _READ_STAGES = ("statics", "tpog", "score")
@@ -131,7 +131,7 @@ class FinishedRun:
             if recorded.get(name) != digest:
                 problem = f"{name} has changed since the sites were scored"
                 raise InputError(self.work.folder.run_record, problem, 'Repeat "egvs run".')
-        return Scorer(get_scene(self.work), tpog, trajectories)
+        return Scorer(self.work.scene, tpog, trajectories)
 
     def artefact(self, name: str) -> Path:
         """Return the path of an artefact; InputError if its hash is not that in ``run.json``."""

@@ -108,9 +108,10 @@ def _points_rasters(run: FinishedRun, sites: Collection[str], grid: Grid) -> Ite
         return
     sensors = [_planned_site(row) for row in plan.rows]
     moved = "moves" in plan.metadata["plan"]
-    rows = list(points_maps(run.work, positions, plan_beams(run.work, sensors, moved=moved)))
+    beams = plan_beams(run.work, sensors, moved=moved)
+    from_sensors = [points for _, points in points_maps(run.work, positions, beams)]
     for place in positions:
-        overlap = overlap_map([row.points for row in rows if row.points.target is place.target])
+        overlap = overlap_map([points for points in from_sensors if points.target is place.target])
         target = place.target.name
         description = f"Sensors of the plan from which a {target} gets {OVERLAP_POINTS:g} points or more"
         peak = float(len(sensors))

@@ -27,7 +27,8 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core import files, limits, reading
+from egvs.core import limits, reading
+from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.core.grid import IntArray
 from egvs.core.platform import relative_path
@@ -138,9 +139,9 @@ def referenced_files(path: Path) -> list[Path]:
 
 def mesh_digests(path: Path, name: str) -> dict[str, str]:
     """Return the SHA-256 of a mesh's file under its ``name``, and of each file that it references."""
-    digests = {name: files.hash_file(path)}
+    digests = {name: hash_input(path)}
     for file in referenced_files(path):
-        digests[f"{name}: {relative_path(file, path.parent)}"] = files.hash_file(file)
+        digests[f"{name}: {relative_path(file, path.parent)}"] = hash_input(file)
     return digests
 
 
@@ -152,7 +153,7 @@ def _existing_files(source: Path, names: Iterable[str]) -> list[Path]:
 
 def _is_file(path: Path) -> bool:
     try:
-        return files.is_input_file(path)
+        return path.is_file()
     except (OSError, ValueError):  # not a valid file name, or too long
         return False
 

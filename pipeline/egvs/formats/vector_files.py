@@ -23,7 +23,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from egvs.core import files, plugins
+from egvs.core import plugins
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE
@@ -50,7 +51,7 @@ def companion_files(path: Path) -> list[Path]:
     if path.suffix.lower() != ".shp":
         return []
     parts = [path.with_suffix(suffix) for suffix in _SHAPEFILE_PARTS]
-    return [part for part in parts if files.is_input_file(part)]
+    return [part for part in parts if part.is_file()]
 
 
 def read_gis_file(path: Path, geometry: str) -> dict[str, Any]:
@@ -104,9 +105,9 @@ def _check_shapefile_complete(path: Path) -> None:
     """
     for suffix in (".shp", ".shx", ".dbf"):
         part = path.with_suffix(suffix)
-        if not files.is_input_file(part):
+        if not part.is_file():
             continue
-        with files.open_input(part) as content:
+        with open_input(part) as content:
             head = content.read(32)
             size = content.seek(0, io.SEEK_END)
         if len(head) < 32:

@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import IO, Any, cast
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder
 
-from egvs.core import files, limits
+from egvs.core import limits
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.reading import COMPLETE_FILE, translate_errors
 
@@ -87,7 +88,7 @@ MAX_DEPTH = 100
 
 def is_gzip(path: Path) -> bool:
     """Return whether the file starts like gzip, whatever its name."""
-    with files.open_input(path) as file:
+    with open_input(path) as file:
         return file.read(2) == _GZIP_MAGIC
 
 
@@ -99,7 +100,7 @@ def open_bounded(path: Path, name: Path | None = None) -> Iterator[IO[bytes]]:
     """
     where = name or path
     try:
-        with files.open_input(path) as file:
+        with open_input(path) as file:
             if not is_gzip(path):
                 yield file
                 return

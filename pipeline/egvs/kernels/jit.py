@@ -79,7 +79,7 @@ def _make_dispatcher(function: Callable[..., Any], options: dict[str, Any]) -> A
     is_cached = _has_cache_folder()
     dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
     if is_cached and hasattr(dispatcher, "enable_caching"):  # a plain function under NUMBA_DISABLE_JIT
-        dispatcher._cache = CheckedCache(function)
+        dispatcher._cache = CheckedCache(function)  # numba has no public way to choose another cache
     return dispatcher
 
 

@@ -37,6 +37,7 @@ from egvs.placement.solver import CurvePoint, Solution
 from egvs.results.plans import ERROR_COLUMNS, PlannedSensor, PlanStep, plan_columns
 from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
+from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import RefinementConfig
 from egvs.scoring import zones as zone_files
@@ -44,7 +45,6 @@ from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scan
 from egvs.sensors.sites import Site
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import open_folder
 from egvs.stages.plan_scans import plan_beams
 from egvs.stages.site_scans import empty_scans
 

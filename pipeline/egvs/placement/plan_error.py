@@ -37,13 +37,13 @@ from egvs.scoring.standard_errors import (
     ScoreUncertainty,
     block_groups,
     detector_groups,
-    means_without_each,
     summarise_uncertainty,
 )
 from egvs.scoring.targets import FrameGroups, recorded_frames, weighted_mean
 from egvs.sensors.sites import Site
 from egvs.stages.base import StageContext
 from egvs.stages.plan_scans import plan_beams
+from egvs.statistics.blocks import means_without_each
 
 SHORT_RECORD = "; the recorded traffic is short for its autocorrelation, so they may be too small"
 """What is added to the origin of standard errors from a short record."""

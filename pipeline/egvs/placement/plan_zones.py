@@ -20,7 +20,6 @@ from egvs.scoring.targets import detection_probability, visible_targets
 from egvs.scoring.zone_results import PLAN_ZONES, ZoneUsers
 from egvs.sensors.sites import Pose, Site
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import get_scene
 from egvs.stages.plan_scans import plan_beams
 from egvs.stages.site_scoring import zone_users
 
@@ -57,7 +56,7 @@ class PlanZones:
             Whether the sensors were moved from their candidates, so that they are scanned anew.
         """
         users = zone_users(context)
-        scene = get_scene(context)
+        scene = context.scene
         sites = [_site(sensor) for sensor in sensors]
         visible = []
         for _, beams in plan_beams(context, sites, moved=moved):

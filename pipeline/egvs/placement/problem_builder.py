@@ -32,7 +32,6 @@ from egvs.scoring.zones import placement_zones, region_bounds_m
 from egvs.sensors.sensor import check_sensor_names
 from egvs.sensors.sites import Site, candidate_sites
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import get_scene
 from egvs.stages.site_scans import SiteScan, empty_scans
 from egvs.stages.site_scoring import TargetScorer
 
@@ -67,7 +66,7 @@ class VoxelView:
 
     def __init__(self, context: StageContext, tpogs: Sequence[Tpog], max_beams: float) -> None:
         self.voxels: IntArray = ever_occupied(tpogs)
-        self._counter = HitCounter(get_scene(context), tpogs[0], context.folder.trajectories)
+        self._counter = HitCounter(context.scene, tpogs[0], context.folder.trajectories)
         self.unit = self._counter.unit
         cap = max_beams * self.unit
         largest_count = _MAX_WHOLE_HITS if self.unit == 1 else _MAX_WEIGHTED_HITS
@@ -106,7 +105,7 @@ class TargetView:
         self.context = context
         self._score = score
         self._detectors = targets.detectors if detectors is None else tuple(detectors)
-        scene = get_scene(context)
+        scene = context.scene
         if score == "expected_detections":
             self.unit = problem.CHANCE_UNIT
         elif scene.weights_beams or scene.acting(Detect, "score"):
@@ -253,7 +252,7 @@ def build_problem(context: StageContext, on_progress: Callable[[int], None]) -> 
         For unknown candidates or periods, unknown costs, and demands that no plan can meet.
     """
     scenario = context.scenario
-    sites = get_scene(context).sites
+    sites = context.scene.sites
     rules = rules_from_config(scenario, sites)
     tpogs = _read_tpogs(context)
 
@@ -319,7 +318,7 @@ def joint_scores(context: StageContext, plans: Sequence[Sequence[str]]) -> list[
         Names of the candidates of each set.
     """
     names = set().union(*plans)
-    used = [site.name for site in get_scene(context).sites if site.name in names]
+    used = [site.name for site in context.scene.sites if site.name in names]
     if not used:
         return [0.0] * len(plans)
     objective = make_objective(context, _read_tpogs(context))

@@ -39,7 +39,6 @@ from egvs.sensors import site_feasibility
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Pose, Site, candidate_sites
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import get_scene
 from egvs.traffic import sumo_folder
 from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
@@ -560,7 +559,7 @@ class _PoseEvaluator:
 
     def __init__(self, context: StageContext, placement_problem: PlacementProblem) -> None:
         self.threads = context.threads
-        self._scene = get_scene(context)
+        self._scene = context.scene
         self._views = placement_problem.views
         self._scanner = Scanner(self._scene)
 

@@ -66,7 +66,7 @@ from egvs.results.ranking import (
 from egvs.results.sensors import SensorComparison, costs_option, range_note
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
-from egvs.stages.scene_inputs import scan_dependencies
+from egvs.stages.scene_dependencies import scan_dependencies
 from egvs.traffic import observed
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ def dependencies(work: StageContext) -> StageDependencies:
     names = [RunFolder.trajectories.name, RunFolder.tpog.name, RunFolder.statics.name, RunFolder.scores.name]
     settings: dict[str, Any] = {"shown": _displayed_settings(scenario), "keep": scenario.scan.keep}
     if scenario.traffic.observed is not None:
-        settings["observed"] = work.inputs.digest(scenario.find(scenario.traffic.observed, observed.KEY))
+        settings["observed"] = work.inputs.digests.of(scenario.find(scenario.traffic.observed, observed.KEY))
         settings["counts"] = describe_counts(scenario, network_file(work.folder.path))
     if map_credits := read_map_credits(scenario):
         settings["map_credits"] = map_credits
@@ -191,7 +191,7 @@ def dependencies(work: StageContext) -> StageDependencies:
     hashes |= work.digests(*(name for name in (*names, *_OPTIONAL_FILES) if work.path(name).is_file()))
     network = work.inputs.common_network_path
     if network is not None:
-        hashes["network"] = work.inputs.digest(network)
+        hashes["network"] = work.inputs.digests.of(network)
     if (roads := network_file(work.folder.path)) is not None:
         hashes |= work.digests(roads.relative_to(work.folder.path).as_posix())
 
@@ -431,6 +431,7 @@ STAGE = Stage(
         RunFolder.zones,
     ),
     effect_stages=("scan", "score"),
+    code=("egvs.stages.scene_inputs",),
     is_view=True,
     prepare=(prepare,),
 )

@@ -71,7 +71,7 @@ class PointsSection:
         box = extent(grid, best)
         by_name = {site.site: site for site in best}
         scans = ((scan.site.name, scan.beams) for scan in empty_scans(work, by_name.keys()))
-        mapped = {(row.site, row.points.target.name): row.points for row in points_maps(work, positions, scans)}
+        mapped = {(site, points.target.name): points for site, points in points_maps(work, positions, scans)}
         figures: list[PointsFigure] = []
         for site in best:
             for positions_of_target in positions:
@@ -79,9 +79,9 @@ class PointsSection:
                 figures.append(_site_figure(site, points, backdrop, box, f"points-{len(figures)}"))
         overlap: list[PointsFigure] = []
         if len(plan) > 1:
-            rows = list(points_maps(work, positions, plan_beams(work, plan, moved=moved)))
+            from_sensors = [points for _, points in points_maps(work, positions, plan_beams(work, plan, moved=moved))]
             for positions_of_target in positions:
-                of_target = [row.points for row in rows if row.points.target is positions_of_target.target]
+                of_target = [points for points in from_sensors if points.target is positions_of_target.target]
                 overlap.append(_overlap_figure(of_target, plan, backdrop, box, f"overlap-{len(overlap)}"))
         return cls(tuple(figures), tuple(overlap))
 

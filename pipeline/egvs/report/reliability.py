@@ -9,13 +9,11 @@ from egvs.core.wording import format_percent
 from egvs.report.sections import FROM_SENSOR_NOTE
 from egvs.results.labels import join_names
 from egvs.results.ranking import RankedSite, Ranking
+from egvs.results.study_results import STUDY
 from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 
 MIN_TILT_DEG = 5.0
 """A sensor is called tilted from this pitch on."""
-
-VALIDATED_PITCH_DEG, VALIDATED_ROLL_DEG = (-25.0, 0.0), 3.0
-"""Limits of pitch, and of roll to either side, of the sensors in the validation study."""
 
 _PITCH_TOLERANCE_DEG = 3.0  # no note on a mount that is aimed slightly up
 
@@ -28,13 +26,13 @@ _SEEDS_NOTE_OF_DETECTORS = (
 )
 _SIZE_NOTE = (
     "The order of sites by this score was validated better than its size: in the study, which was simulated, the "
-    "shares found differed from the expected ones by 3 to 8 percentage points for the detectors that it stands for, "
-    "and by up to 14 for another one (docs/validity.md)."
-)
+    "shares found differed from the expected ones by {} to {} percentage points for the detectors that it stands "
+    "for, and by up to {} for another one (docs/validity.md)."
+).format(*STUDY.larger_study.level_error_points, STUDY.larger_study.largest_level_error_points)
 _COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = (
-    "The tilt of {} is outside the range of the validation (pitch -25 to 0 degrees, positive is up; roll up to 3 "
-    "degrees; docs/validity.md)."
+    "The tilt of {} is outside the range of the validation (pitch {:g} to {:g} degrees, positive is up; roll up to "
+    "{:g} degrees; docs/validity.md)."
 )
 
 
@@ -74,10 +72,10 @@ def describe_reliability(
     sentences += [
         _COVERAGE_NOTE.format(format_percent(coverage["share"], 0), coverage["of"]) for coverage in recordings
     ]
-    low_deg, high_deg = VALIDATED_PITCH_DEG
+    (low_deg, high_deg), roll_deg = STUDY.larger_study.pitch_deg, STUDY.larger_study.roll_deg
     is_pitched = not low_deg - _PITCH_TOLERANCE_DEG <= best.pitch_deg <= high_deg + _PITCH_TOLERANCE_DEG
-    if is_pitched or abs(best.roll_deg) > VALIDATED_ROLL_DEG:
-        sentences.append(_TILT_NOTE.format(best.site))
+    if is_pitched or abs(best.roll_deg) > roll_deg:
+        sentences.append(_TILT_NOTE.format(best.site, low_deg, high_deg, roll_deg))
     limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
     if limits:
         sentences.append(f"The best site has {join_names(limits)}: one beyond what was tried may be better.")

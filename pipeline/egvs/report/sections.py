@@ -3,7 +3,7 @@
 A result is shown if it was computed from the same inputs as the run (:func:`_is_current`).
 
 :func:`ranking_disagreement` compares the EGVS with the recommended score by the evidence of the validation study
-(docs/validity.md), which is a table beside this module; a setting that was not measured is not in it.
+(:mod:`egvs.results.study_results`); a setting that was not measured is not in it.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from egvs.report import plan_answer
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
 from egvs.results.plans import PlanStep, plan_steps
 from egvs.results.ranking import MapSite, Pole, RankedSite
+from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 from egvs.scenario.signal_config import ASSUMED_PLANS
@@ -42,20 +43,17 @@ from egvs.traffic.signal_descriptions import ASSUMED_SOURCE, plan_title
 COMPARED_SITES = 3
 """Number of best sites that :func:`ranking_disagreement` compares."""
 
-RHO: Mapping[str, Mapping[str, float]] = json.loads(
-    Path(__file__).with_name("sections.json").read_text(encoding="utf-8")
+RHO_RANGE = (
+    "{:.2f} to {:.2f}, depending on junction and detector; among sites of equal height, {:.2f} to {:.2f}".format(
+        *STUDY.larger_study.rho, *STUDY.larger_study.rho_at_equal_height
+    )
 )
-"""Rank correlation (Spearman's rho) of scores with detection at the held-out junctions of the study: score -> detector
--> rho with AP (mean of BEV and 3D, IoU 0.7), from the table of all scores under F in docs/validity-tables.md. The EGVS
-has one entry per setting, named by :func:`egvs_setting`."""
-
-RHO_RANGE = "0.93 to 0.98, depending on junction and detector; among sites of equal height, 0.90 to 0.97"
 """Rank correlation of the recommended score with detection, over the held-out junctions and the detectors of the larger
 study (docs/validity.md)."""
 
 FROM_SENSOR_NOTE = (
-    "This detector measures heights from the sensor, and the score for it was tested at 13 sites of one junction only "
-    "(docs/validity.md)."
+    "This detector measures heights from the sensor, and the score for it was tested at "
+    f"{STUDY.heights_from_sensor.sites} sites of one junction only (docs/validity.md)."
 )
 
 NAMED_POLES = 5
@@ -195,13 +193,16 @@ def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:
 
 
 def egvs_setting(gamma: float, voxel_m: float, *, moving_occlusion: bool = False) -> str:
-    """Return the key of an EGVS setting in :data:`RHO`."""
+    """Return the key of an EGVS setting in :attr:`egvs.results.study_results.FirstStudy.rho`."""
     occlusion = "moving occlusion, " if moving_occlusion else ""
     return f"egvs (gamma {gamma:g}, {occlusion}voxel {voxel_m:g})"
 
 
 def ranking_disagreement(
-    sites: Sequence[RankedSite], egvs: str, rho: Mapping[str, Mapping[str, float]] = RHO, detectors: Sequence[str] = ()
+    sites: Sequence[RankedSite],
+    egvs: str,
+    rho: Mapping[str, Mapping[str, float]] = STUDY.first_study.rho,
+    detectors: Sequence[str] = (),
 ) -> str:
     """Return sentences if the EGVS and the recommended score have different best sites; empty otherwise.
 
@@ -212,7 +213,7 @@ def ranking_disagreement(
     egvs
         The EGVS setting of the run, from :func:`egvs_setting`.
     rho
-        The evidence; :data:`RHO` by default.
+        The evidence, by score and detector; that of the first study by default.
     detectors
         Detectors that the recommended score stands for.
     """

@@ -13,6 +13,7 @@ from egvs.artefacts.command_results import read_results
 from egvs.artefacts.run_folder import COMMAND_RESULTS, RunFolder
 from egvs.artefacts.run_record import StageRecord
 from egvs.core import files
+from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.scenario.model import Scenario
 
@@ -32,7 +33,7 @@ def what_if_digest(scenario: Scenario, tables: Iterable[str]) -> str | None:
         table = scenario.what_if[name]
         named = [*table.footprints, *([table.vehicles] if table.vehicles else [])]
         try:
-            digests = [files.hash_file(scenario.find(file, f"what_if.{name}")) for file in named]
+            digests = [hash_input(scenario.find(file, f"what_if.{name}")) for file in named]
         except InputError:  # a file was removed since
             return None
         values.append([name, table.model_dump(mode="json"), digests])

@@ -6,7 +6,7 @@ import json
 import re
 from pathlib import Path
 
-from egvs.core import files
+from egvs.core.digests import open_input
 from egvs.scenario.model import Scenario
 
 _HEAD_BYTES = 4096
@@ -35,7 +35,7 @@ def read_map_credits(scenario: Scenario) -> tuple[str, ...]:
 
 
 def _read_attributions(path: Path) -> list[str]:
-    with files.open_input(path) as file:
+    with open_input(path) as file:
         head = file.read(_HEAD_BYTES).decode("utf-8", "ignore").partition('"features"')[0]
     match = _ATTRIBUTION.search(head)
     if match is None:

@@ -22,15 +22,17 @@ from statistics import NormalDist
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.results.labels import SCORE_LABELS, format_count
 from egvs.results.ranking import RankedSite
+from egvs.results.study_results import STUDY
 from egvs.scenario.score_config import COST_COLUMN, DEFAULT_SCORE, CostsConfig
 
 SENSOR_EVIDENCE = (
     "How far to trust this: in simulation, at six held-out junctions with twelve sensors, the mean of cluster and "
-    "pointpillars ranked sites nearly as three detectors do (rank correlation 0.93 to 0.98). But the first of a "
-    "ranking lost up to 8 points of AP, and 20 once; shares found with OS0-128 and OS1-64 are 6 to 9 points higher "
-    "than expected. Do not decide between sensors by less than about 10 points, nor by the cost of one more point. "
-    "See docs/validity.md."
-)
+    "pointpillars ranked sites nearly as three detectors do (rank correlation {rho[0]:.2f} to {rho[1]:.2f}). But the "
+    "first of a ranking lost up to {loss_points} points of AP, and {largest_loss_points} once; shares found with "
+    "{underrated_sensors[0]} and {underrated_sensors[1]} are {underrated_points[0]} to {underrated_points[1]} points "
+    "higher than expected. Do not decide between sensors by less than about 10 points, nor by the cost of one more "
+    "point. See docs/validity.md."
+).format(**dict(STUDY.larger_study))
 """What is known about rankings of sensors by the recommended score (docs/validity.md)."""
 
 _NO_EVIDENCE = (

@@ -76,9 +76,7 @@ class BackgroundStage:
         return True
 
     def _run(self) -> StageResult:
-        context = StageContext(
-            self._context.inputs, self._pending, jobs=self._context.threads, progress=self._report_progress
-        )
+        context = self._context.with_folder(self._pending, self._report_progress)
         with threads.at_checkpoints(self._check_in):
             return stage_registry.run_stage(self._name, context, self._dependencies)
 

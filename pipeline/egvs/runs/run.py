@@ -25,7 +25,7 @@ from egvs._version import __version__
 from egvs.artefacts.origin import foreign_files
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
-from egvs.core import files
+from egvs.core.digests import use_digests
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.platform import relative_path
 from egvs.core.progress import ProgressCallback, no_progress
@@ -34,6 +34,7 @@ from egvs.runs import locks, run_names, stage_keys, stage_registry, store
 from egvs.runs.background import BackgroundStage, run_in_background
 from egvs.runs.digest_cache import remember_digests
 from egvs.runs.kernel_compiler import KernelCompiler
+from egvs.runs.run_context import open_folder
 from egvs.runs.stage_keys import StageKey
 from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
@@ -41,7 +42,7 @@ from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
 from egvs.stages import inputs as stage_inputs
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import Inputs, open_folder
+from egvs.stages.inputs import Inputs
 from egvs.traffic.sumo_folder import NETWORK_FILE
 
 StageListener = Callable[[str, str, StageRecord | None], None]
@@ -109,8 +110,8 @@ def run(
     """
     folder = Path(out) if out is not None else default_folder(scenario)
     check_no_overwrite(scenario, folder)
-    with lock_run_folder(folder, wait_s), files.hold_inputs(except_in=folder), remember_digests(RunFolder(folder)):
-        context = open_folder(scenario, folder, jobs=jobs, progress=progress)
+    with lock_run_folder(folder, wait_s), remember_digests(RunFolder(folder)) as digests:
+        context = open_folder(scenario, folder, jobs=jobs, progress=progress, digests=digests)
         current = _Run(context, start_record(scenario, folder), listener)
         stages = [stage for stage in STAGE_NAMES if stage in only]
         key = None
@@ -140,15 +141,16 @@ def run_one(
     Parameters are those of :func:`run`; ``options`` are further keyword arguments of the stage.
     """
     check_no_overwrite(scenario, out)
-    with lock_run_folder(out), files.hold_inputs(except_in=out):
+    with lock_run_folder(out):
         record = start_record(scenario, out)
         recorded = stage_registry.recorded_digests(record)
         context = open_folder(scenario, out, jobs=jobs, progress=progress, recorded=recorded)
         current = _Run(context, record, listener)
-        for earlier in stages_before(stage):
-            current.restore_stage(earlier)
-        current.ensure_stage(stage, options, again=True)
-        return current.finish(keep=(stage,))
+        with use_digests(context.inputs.digests):
+            for earlier in stages_before(stage):
+                current.restore_stage(earlier)
+            current.ensure_stage(stage, options, again=True)
+            return current.finish(keep=(stage,))
 
 
 def stages_before(stage: str) -> list[str]:

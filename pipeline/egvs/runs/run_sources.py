@@ -17,10 +17,10 @@ from egvs.artefacts.run_record import RunRecord, suggest_runs
 from egvs.core.errors import InputError
 from egvs.runs import stage_keys
 from egvs.runs.run import default_folder
+from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import apply_overrides, load, scenario_from_dict
 from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scenario.settings import changed_settings
-from egvs.stages.inputs import open_folder
 
 PLAN_REQUEST = ("placement.count", "placement.budget", "placement.reach")
 """Settings that ``egvs place`` replaces by its options: a run keeps its folder when another plan is requested."""

@@ -24,6 +24,7 @@ from typing import Any
 from egvs.artefacts import parquet
 from egvs.artefacts.run_record import StageRecord
 from egvs.core import files
+from egvs.core.digests import hash_input
 from egvs.effects import registry
 from egvs.runs import stage_registry
 from egvs.runs.stage_registry import StageResult, stage
@@ -230,8 +231,6 @@ def program_inputs(name: str, scenario: Scenario, loaded: tuple[str, ...] = ()) 
     described = stage(name)
     effects = registry.scenario_effects(scenario, *(described.effect_stages or (name,)))
     modules = sorted({*loaded, *registry.effect_modules(effects)})
-    if any(module.partition(".")[0] != PACKAGE for module in modules):
-        files.tell_observers(None)  # the source of plug-ins is found anew in each run
     source = source_digest(described.module, *described.code)
     loaded_sources = [source_digest(module) for module in modules]
     libraries = source.libraries.union(*(part.libraries for part in loaded_sources))
@@ -239,7 +238,7 @@ def program_inputs(name: str, scenario: Scenario, loaded: tuple[str, ...] = ()) 
         "source": source.digest,
         "loaded": [part.digest for part in loaded_sources],
         "named": registry.effect_settings(effects),
-        "files": {path.name: files.hash_file(path) for path in _data_files(described)},
+        "files": {path.name: hash_input(path) for path in _data_files(described)},
         "libraries": library_versions(libraries),
     }
 

@@ -16,8 +16,8 @@ from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs import stage_keys, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, start_record
+from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import scenario_from_dict
-from egvs.stages.inputs import open_folder
 
 
 def verify(

@@ -25,7 +25,6 @@ from pydantic import (
     model_validator,
 )
 
-from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid, Roi
 from egvs.core.sumo_home import sumo_home
@@ -495,7 +494,7 @@ class Scenario(StrictModel):
         folders = (sumo_home(),) if name.startswith(_SUMO_HOME_PREFIX) else self._folders
         paths = [folder / name.removeprefix(_SUMO_HOME_PREFIX) for folder in folders]
         for path in paths:
-            if not files.is_input_file(path):
+            if not path.is_file():
                 continue
             if not os.access(path, os.R_OK):
                 raise InputError(where, f"cannot be read ({path}: Permission denied)", "Check its permissions.")

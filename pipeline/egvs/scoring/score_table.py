@@ -26,15 +26,9 @@ from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scoring.scorer import SiteScore, ranks
-from egvs.scoring.standard_errors import (
-    BlockGroups,
-    LagBehindBest,
-    ScoreUncertainty,
-    beats_next,
-    lag_behind_best,
-    rank_order,
-)
+from egvs.scoring.standard_errors import BlockGroups, LagBehindBest, ScoreUncertainty, beats_next, lag_behind_best
 from egvs.scoring.target_scores import SiteTargetScores
+from egvs.statistics.ranks import rank_order
 
 MIX = ""
 """Period of the scores over all traffic: the mix of the periods where there are some."""

@@ -17,10 +17,10 @@ instead of ten, and it needs random numbers. The jackknife's intervals cover 89 
 
 Groups must be longer than the traffic's autocorrelation time (:mod:`egvs.statistics.blocks`). Up to 19
 blocks are taken as they are, more are joined to ten groups - with fifty the same intervals cover 83 % - and neighbours
-are joined further where groups would be shorter than :data:`GROUP_LENGTH_TIMES` of it, down to
-:data:`MIN_GROUPS` groups: the t quantile accounts for the uncertainty of few groups. The correlation that remains
-between the groups of a short record inflates the error
-(:func:`standard_error_inflation`). Where neighbouring groups are correlated all the same,
+are joined further where groups would be shorter than :data:`egvs.statistics.blocks.GROUP_LENGTH_TIMES` of it, down to
+:data:`egvs.statistics.blocks.MIN_GROUPS` groups: the t quantile accounts for the uncertainty of few groups. The
+correlation that remains between the groups of a short record inflates the error
+(:func:`egvs.statistics.blocks.standard_error_inflation`). Where neighbouring groups are correlated all the same,
 they are joined in pairs. Groups shorter than the window in which that time was estimated, and groups that stay
 correlated, give a warning.
 
@@ -69,22 +69,19 @@ from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.special import stdtr, stdtrit
 from egvs.kernels.occupancy import accumulate
 from egvs.scoring.egvs import EntropyField, Hits, sum_hits_by_class
-from egvs.statistics.blocks import WINDOW_TIMES
-
-TARGET_GROUPS = 10
-"""Number of groups that blocks are joined to when there are at least twice as many."""
-
-MIN_GROUPS = 4
-"""Groups are not joined to fewer than this."""
-
-GROUP_LENGTH_TIMES = 20.0
-"""Desired length of a group, in autocorrelation times of the traffic."""
+from egvs.statistics.blocks import (
+    GROUP_LENGTH_TIMES,
+    MIN_GROUPS,
+    WINDOW_TIMES,
+    critical_autocorrelation,
+    group_sizes,
+    lag_one_autocorrelation,
+    standard_error_inflation,
+)
+from egvs.statistics.ranks import rank_order
 
 CONFIDENCE_LEVEL = 0.9
 """Confidence of intervals."""
-
-_CORRELATION_QUANTILE = 1.645
-"""One-sided 5 % point of the normal distribution, for the test of neighbouring groups."""
 
 _CLASS_KEY_SEED = 0x9E3779B97F4A7C15
 """Seed of the keys that distinguish classes: a constant, so that equal files give equal bytes."""
@@ -117,17 +114,6 @@ class BlockGroups:
         return int(self.frames.sum())
 
 
-def group_sizes(blocks: int, block_frames: int = 1, autocorrelation_frames: float = 0.0) -> list[int]:
-    """Return the number of consecutive blocks of each group."""
-    groups = blocks
-    if blocks >= 2 * TARGET_GROUPS:
-        groups = TARGET_GROUPS
-    needed_blocks = math.ceil(GROUP_LENGTH_TIMES * autocorrelation_frames / block_frames)
-    if needed_blocks > blocks // groups:
-        groups = min(groups, max(MIN_GROUPS, blocks // needed_blocks))
-    return [len(part) for part in np.array_split(np.arange(blocks), groups)]
-
-
 def block_groups(period: tpog_file.PeriodBlocks) -> BlockGroups:
     """Return the groups that the blocks of one record are joined to: one of each seed, if there are several."""
     if period.seeds > 1:
@@ -142,17 +128,6 @@ def detector_groups(detectors: int) -> tuple[BlockGroups, ...]:
     if detectors < 2:
         return ()
     return (BlockGroups(np.ones(detectors, dtype=np.int64), 0.0, are_detectors=True),)
-
-
-def means_without_each(values: FloatArray) -> FloatArray:
-    """Return the mean of all values but each, (d,) float64: the replicates of a mean over d detectors, 2 or more.
-
-    Examples
-    --------
-    >>> means_without_each(np.array([0.5, 0.7, 0.9])).round(3).tolist()
-    [0.8, 0.7, 0.6]
-    """
-    return np.array([np.delete(values, number).mean() for number in range(len(values))])
 
 
 @dataclass(frozen=True)
@@ -412,7 +387,7 @@ class Stratum:
         joined = 1
         if groups.are_seeds or groups.are_detectors:
             return cls(pseudo, h - 1.0, centre, 1.0, groups, first_correlation, joined, still_correlated=False)
-        while correlation > _critical_autocorrelation(len(pseudo)) and len(pseudo) // 2 >= MIN_GROUPS:
+        while correlation > critical_autocorrelation(len(pseudo)) and len(pseudo) // 2 >= MIN_GROUPS:
             pseudo, frames = _join_pairs(pseudo, frames)
             joined *= 2
             correlation = lag_one_autocorrelation(pseudo[:, :n_joined_by])
@@ -420,7 +395,7 @@ class Stratum:
         widening = 1.0
         if groups.autocorrelation_frames:
             widening = standard_error_inflation(groups.autocorrelation_frames, groups.total, len(frames))
-        still_correlated = correlation > _critical_autocorrelation(len(pseudo))
+        still_correlated = correlation > critical_autocorrelation(len(pseudo))
         spread = groups.total / frames - 1.0
         return cls(pseudo, spread, centre, widening, groups, first_correlation, joined, still_correlated)
 
@@ -439,63 +414,6 @@ class Stratum:
         if self.groups.are_seeds or self.groups.are_detectors:
             return False
         return self.groups.total < len(self.pseudo) * WINDOW_TIMES * self.groups.autocorrelation_frames
-
-
-def _time_upper_bound(time_frames: float, frames: int) -> float:
-    """Return an autocorrelation time one standard deviation above the estimate from a record of so many frames."""
-    return time_frames * (1.0 + math.sqrt(2.0 * (2.0 * WINDOW_TIMES * time_frames + 1.0) / frames))
-
-
-def standard_error_inflation(time_frames: float, frames: int, groups: int) -> float:
-    r"""Return the factor by which the scatter of consecutive groups of frames underestimates a standard error.
-
-    For an autocorrelation that decays as :math:`e^{-2 t / \tau}`, a mean over n frames has the variance
-
-    .. math:: \sigma^2 \tau f(n) / n, \qquad f(n) = 1 - (1 - e^{-x}) / x, \qquad x = 2 n / \tau
-
-    (Priestley, Spectral Analysis and Time Series, 1981, section 5.3). Groups are then correlated, and their scatter
-    underestimates the variance of the mean: of k groups with variance V each and V_T of all frames, it gives
-    (V - V_T) / (k - 1) instead of V_T.
-
-    Parameters
-    ----------
-    time_frames
-        Autocorrelation time of the traffic, in frames.
-    frames
-        Frames of the record.
-    groups
-        Number of groups that the record was cut into, at least 2.
-
-    Returns
-    -------
-    float
-        Factor for the standard error, at least 1; for the longest autocorrelation time that the record does not exclude
-        (:func:`_time_upper_bound`).
-    """
-    longest = _time_upper_bound(time_frames, frames)
-    ratio = groups * _variance_share(2.0 * frames / groups / longest) / _variance_share(2.0 * frames / longest)
-    return max(1.0, math.sqrt((groups - 1.0) / (ratio - 1.0)))
-
-
-def _variance_share(x: float) -> float:
-    return 1.0 + math.expm1(-x) / x
-
-
-def lag_one_autocorrelation(series: FloatArray) -> float:
-    """Return the lag-one autocorrelation of groups, (k, n), pooled over all sites; 0 where nothing varies."""
-    centred = series - series.mean(axis=0)
-    scale = np.sqrt((centred**2).sum(axis=0))
-    centred = centred[:, scale > 0] / scale[scale > 0]
-    if not centred.size:
-        return 0.0
-    return float((centred[1:] * centred[:-1]).sum(axis=0).mean())
-
-
-def _critical_autocorrelation(groups: int) -> float:
-    """Return the autocorrelation that independent groups exceed once in 20 (Kendall and Ord, Time Series, 1990)."""
-    if groups <= 2:
-        return 1.0
-    return -1.0 / groups + _CORRELATION_QUANTILE * math.sqrt((groups - 2) / (groups**2 - 1.0))
 
 
 def _join_pairs(pseudo: FloatArray, frames: IntArray) -> tuple[FloatArray, IntArray]:
@@ -639,11 +557,6 @@ class ScoreUncertainty:
 
 def _sum_of_variances(strata: Sequence[Stratum], a: IntArray, b: IntArray | None) -> FloatArray:
     return sum((stratum.variance(a, b) for stratum in strata), np.zeros(len(a)))
-
-
-def rank_order(scores: FloatArray) -> IntArray:
-    """Return sites by score, best first; equal scores in the order of the sites."""
-    return np.argsort(-scores, kind="stable")
 
 
 def beats_next(estimate: ScoreUncertainty) -> FloatArray:

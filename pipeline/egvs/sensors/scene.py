@@ -1,7 +1,7 @@
 """A scene: the static world, the candidate sites, their sensors and the active effects, resolved once.
 
-:func:`egvs.stages.inputs.resolve_scene` builds the scene. Later steps take its parts from it instead of reading a file
-again. A scene can be sent to another process.
+:func:`egvs.stages.scene_inputs.resolve_scene` builds the scene. Later steps take its parts from it instead of
+reading a file again. A scene can be sent to another process.
 """
 
 from __future__ import annotations

@@ -36,6 +36,7 @@ import numpy as np
 from pydantic import Field
 
 from egvs.core import files, limits
+from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
@@ -121,7 +122,7 @@ def read_beam_table(path: Path) -> BeamTable:
     InputError
         Naming file, row and value.
     """
-    return _read_cached(path, files.hash_file(path))
+    return _read_cached(path, hash_input(path))
 
 
 @lru_cache(maxsize=4)

@@ -23,11 +23,12 @@ import reprlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from egvs.core import files, limits
+from egvs.core import limits
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError, find_misspelling
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
@@ -96,7 +97,7 @@ def read_csv(path: Path, world: Georeference) -> Iterator[SiteRow]:
     located = []
     try:
         with (
-            files.open_input(path) as content,
+            open_input(path) as content,
             io.TextIOWrapper(content, encoding="utf-8-sig", newline="") as file,
         ):
             reader = csv.DictReader(file, skipinitialspace=True)
@@ -189,20 +190,6 @@ def _point_to_world(point: list[Any], reading: CoordinateReading) -> list[Any]:
     return [*reading.to_world(np.array([[x, y]]))[0].tolist(), *point[2:]]
 
 
-class _LonLatColumns(NamedTuple):
-    """Names of the columns of longitude and latitude in a row."""
-
-    lon: str
-    lat: str
-
-
-class _LonLat(NamedTuple):
-    """Longitude and latitude, degrees."""
-
-    lon_deg: float
-    lat_deg: float
-
-
 def rows_in_world_frame(rows: Iterable[SiteRow], path: object, world: Georeference) -> list[dict[str, Any]]:
     """Return the columns of CSV rows with ``x_m, y_m`` in the world frame, and without longitude and latitude.
 
@@ -238,33 +225,34 @@ def rows_in_world_frame(rows: Iterable[SiteRow], path: object, world: Georeferen
     return located
 
 
-def _as_points(pairs: list[tuple[float, float]] | list[_LonLat]) -> FloatArray:
+def _as_points(pairs: list[tuple[float, float]]) -> FloatArray:
     return np.array(pairs).reshape(-1, 2)
 
 
-def _lon_lat_columns(row: Mapping[str, Any]) -> _LonLatColumns | None:
+def _lon_lat_columns(row: Mapping[str, Any]) -> tuple[str, str] | None:
     """The names of the row's columns of longitude and latitude; None unless it has both."""
     by_lower_name = {name.strip().lower(): name for name in row if isinstance(name, str)}
     lon = next((by_lower_name[name] for name in LONGITUDE if name in by_lower_name), None)
     lat = next((by_lower_name[name] for name in LATITUDE if name in by_lower_name), None)
     if lon is None or lat is None:
         return None
-    return _LonLatColumns(lon, lat)
+    return lon, lat
 
 
-def _parse_lon_lat(row: SiteRow, columns: _LonLatColumns | None) -> _LonLat | None:
-    """Longitude and latitude of a row, checked; None where both are empty."""
+def _parse_lon_lat(row: SiteRow, columns: tuple[str, str] | None) -> tuple[float, float] | None:
+    """Longitude and latitude of a row, degrees, checked; None where both are empty."""
     if columns is None or all(row.columns[name] in (None, "") for name in columns):
         return None
-    for name, limit_deg in ((columns.lon, 180.0), (columns.lat, 90.0)):
+    lon, lat = columns
+    for name, limit_deg in ((lon, 180.0), (lat, 90.0)):
         value = row.columns[name]
         if not abs(_number_or_nan(value)) <= limit_deg:
             problem = f"expected degrees from {-limit_deg:g} to {limit_deg:g}, got {repr(value)[:80]}"
             raise InputError(f"{row.where}: {name}", problem)
-    return _LonLat(_number_or_nan(row.columns[columns.lon]), _number_or_nan(row.columns[columns.lat]))
+    return _number_or_nan(row.columns[lon]), _number_or_nan(row.columns[lat])
 
 
-def _row_to_world(row: SiteRow, lon_lat: _LonLat | None, reading: CoordinateReading) -> dict[str, float]:
+def _row_to_world(row: SiteRow, lon_lat: tuple[float, float] | None, reading: CoordinateReading) -> dict[str, float]:
     """x_m and y_m of a row from its longitude and latitude; nothing where it has x_m and y_m, which must agree."""
     if lon_lat is None:
         return {}

@@ -8,15 +8,13 @@ so a stage whose dependencies did not change is skipped. No stage imports anothe
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Concatenate, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Concatenate
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFile, RunFolder
 from egvs.core import files
-from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.core.threads import thread_count
 from egvs.scenario.model import Scenario
 
 if TYPE_CHECKING:
@@ -26,7 +24,6 @@ if TYPE_CHECKING:
     from egvs.stages.inputs import Inputs
     from egvs.world.mesh import World
 
-T = TypeVar("T")
 Json = Mapping[str, Any]
 Summary = dict[str, Any]
 """Outcome of a stage, for ``run.json`` and the terminal."""
@@ -113,39 +110,46 @@ class Stage:
         return tuple(file.name for file in RunFolder.written_by(self.name) if file.is_folder)
 
 
+@dataclass(frozen=True, eq=False)
 class StageContext:
-    """A run folder while stages work in it.
+    """A run folder while stages work in it; see :func:`egvs.runs.run_context.open_folder`.
 
-    Parameters
+    Attributes
     ----------
+    scenario
+        The scenario.
     inputs
-        The scenario and what it names, resolved once.
+        What the scenario names, resolved once.
     folder
         Where artefacts are read and written.
-    jobs
-        Number of threads; one per core when None. Results do not depend on it.
-    recorded
-        Digests in ``run.json`` by artefact, "" for an artefact that no stage recorded. An artefact with another digest
-        is refused. None where nothing is recorded, as in a notebook.
+    threads
+        Number of threads. Results do not depend on it.
+    progress
+        Called as the work proceeds.
     """
 
-    def __init__(
-        self,
-        inputs: Inputs,
-        folder: RunFolder,
-        *,
-        jobs: int | None = None,
-        progress: ProgressCallback = no_progress,
-        recorded: Mapping[str, str] | None = None,
-    ) -> None:
-        self.inputs = inputs
-        self.scenario: Scenario = inputs.scenario
-        self.folder = folder
-        self.progress = progress
-        self.threads = thread_count(jobs)
-        self._recorded = dict(recorded or {})
-        self._digests: dict[str, str] = {}
-        self._remembered: dict[str, tuple[tuple[str, ...], Any]] = {}
+    scenario: Scenario
+    inputs: Inputs
+    folder: RunFolder
+    threads: int
+    progress: ProgressCallback = no_progress
+
+    def with_scenario(self, scenario: Scenario) -> StageContext:
+        """Return the context of a scenario with other [score], [placement] or [scan]; both share the scene.
+
+        Raises
+        ------
+        ValueError
+            When the scenarios differ in more.
+        """
+        free = {name: getattr(scenario, name) for name in ("score", "placement", "scan")}
+        if self.scenario.model_copy(update=free) != scenario:
+            raise ValueError("expected a scenario that differs in score, placement and scan only")
+        return replace(self, scenario=scenario)
+
+    def with_folder(self, folder: RunFolder, progress: ProgressCallback) -> StageContext:
+        """Return the context of the same scenario in another folder."""
+        return replace(self, folder=folder, progress=progress)
 
     @property
     def world(self) -> World:
@@ -164,26 +168,8 @@ class StageContext:
         return self.folder.path / artefact
 
     def digest(self, artefact: str) -> str:
-        """Return the sha256 of an artefact, which is computed once until :meth:`forget`.
-
-        Raises
-        ------
-        InputError
-            When the artefact is missing, or differs from the one in ``run.json``.
-        """
-        if artefact in self._digests:
-            return self._digests[artefact]
-
-        digest = files.hash_file(self.path(artefact))
-        recorded = self._recorded.get(artefact, digest)
-        hint = 'Repeat "egvs run" to create it.'
-        if recorded == "":
-            raise InputError(self.path(artefact), "was not created by any stage recorded in run.json", hint)
-        if recorded != digest:
-            problem = f"was altered or replaced (sha256 {digest[:12]}, in run.json {recorded[:12]})"
-            raise InputError(self.path(artefact), problem, hint)
-        self._digests[artefact] = digest
-        return digest
+        """Return the sha256 of an artefact; InputError as of :meth:`egvs.core.digests.Digests.of`."""
+        return self.inputs.digests.of(self.path(artefact))
 
     def digests(self, *artefacts: str) -> dict[str, str]:
         """Return the sha256 of some artefacts, by name."""
@@ -191,19 +177,7 @@ class StageContext:
 
     def forget(self, *names: str) -> None:
         """Forget the digests of artefacts, or of all files in a folder, that are about to be written."""
-        for digests in (self._digests, self._recorded):
-            for artefact in list(digests):
-                folder = artefact.partition("/")[0]
-                if artefact in names or folder in names:
-                    del digests[artefact]
-
-    def remember(self, what: str, artefacts: tuple[str, ...], make: Callable[[], T]) -> T:
-        """Return the value of ``make``, which is called again only after one of the artefacts has changed."""
-        digests = tuple(self.digest(name) for name in artefacts)
-        if what not in self._remembered or self._remembered[what][0] != digests:
-            self._remembered[what] = digests, make()
-        value: T = self._remembered[what][1]
-        return value
+        self.inputs.digests.forget(*map(self.path, names))
 
     def metadata(self, dependencies: StageDependencies, *, seeded: bool = True, **more: Any) -> dict[str, Any]:
         """Return the metadata that every artefact contains.

@@ -19,7 +19,7 @@ from egvs.stages import inputs as stage_inputs
 from egvs.stages import scene_checks, traffic_checks
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.inputs import CheckInputs, Inputs
-from egvs.stages.scene_inputs import sensor_digests
+from egvs.stages.scene_dependencies import sensor_digests
 from egvs.world import geolocation
 
 RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (

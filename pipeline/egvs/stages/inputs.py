@@ -7,14 +7,14 @@ errors and leaves out what cannot be read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core import files
+from egvs.core.digests import Digests
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
@@ -28,15 +28,15 @@ from egvs.sensors.scene import ActiveEffect, InactiveEffect, Scene
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Site
 from egvs.stages import scene_inputs
-from egvs.stages.base import StageContext
-from egvs.stages.scene_inputs import resolve_scene as resolve_scene
-from egvs.stages.scene_inputs import with_effects as with_effects
 from egvs.traffic import sumo_folder
 from egvs.traffic.network import Network
 from egvs.world import geolocation, mesh, static_world
 from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
 from egvs.world.static_world import BuildCounts
+
+if TYPE_CHECKING:
+    from egvs.sensors.scanner import Scanner
 
 T = TypeVar("T")
 
@@ -60,12 +60,14 @@ class Inputs:
         Run folder whose ``statics.ply`` holds the static world, unless it is built here; None to build it.
     progress
         Called while the static world is built.
+    digests
+        The digests of input files and artefacts.
     """
 
     scenario: Scenario
     folder: RunFolder | None = None
     progress: ProgressCallback = no_progress
-    _digests: dict[Path, str] = field(default_factory=dict, init=False, repr=False)
+    digests: Digests = field(default_factory=Digests)
 
     @cached_property
     def georeference(self) -> Georeference:
@@ -128,6 +130,15 @@ class Inputs:
         """Static world, sites, sensors and active effects: the parts that beams need."""
         return scene_inputs.with_effects(self.plain_scene)
 
+    @cached_property
+    def scanner(self) -> Scanner:
+        """The scanner of the scene, which can cast every site."""
+        from egvs.sensors.scanner import Scanner
+
+        scanner = Scanner(self.scene)
+        scanner.check(self.scene.sites)
+        return scanner
+
     @property
     def sites(self) -> tuple[Site, ...]:
         """The sites that are scanned and scored."""
@@ -147,31 +158,6 @@ class Inputs:
     def inactive_effects(self) -> tuple[InactiveEffect, ...]:
         """The named effects of these stages that provably change nothing."""
         return self.scene.inactive_effects
-
-    def digest(self, path: Path) -> str:
-        """Return the sha256 of an input file, computed once."""
-        if path not in self._digests:
-            self._digests[path] = files.hash_file(path)
-        return self._digests[path]
-
-
-def open_folder(
-    scenario: Scenario,
-    folder: Path,
-    *,
-    jobs: int | None = None,
-    progress: ProgressCallback = no_progress,
-    recorded: Mapping[str, str] | None = None,
-) -> StageContext:
-    """Return the context of stages that work in a run folder; parameters as of :class:`StageContext`."""
-    run_folder = RunFolder(folder)
-    inputs = Inputs(scenario, run_folder, progress)
-    return StageContext(inputs, run_folder, jobs=jobs, progress=progress, recorded=recorded)
-
-
-def get_scene(context: StageContext) -> Scene:
-    """Return :attr:`StageContext.scene`."""
-    return context.scene
 
 
 def build_scene(scenario: Scenario) -> Scene:
@@ -270,7 +256,7 @@ def file_digests(inputs: Inputs) -> dict[str, str]:
         digest = _file_presence(scenario, key, name)
         if digest != MISSING and key != POINTS_KEY:
             path = scenario.find(name, key)
-            digest = inputs.digest(path)
+            digest = inputs.digests.of(path)
             if key == "statics.meshes":
                 mesh_paths.append(path)
         digests[f"{key} = {name}"] = digest
@@ -281,7 +267,7 @@ def file_digests(inputs: Inputs) -> dict[str, str]:
     for path in mesh_paths:
         paths += referenced_files(path)
     for number, path in enumerate(paths):
-        digests[f"{number}: {path.name}"] = inputs.digest(path)
+        digests[f"{number}: {path.name}"] = inputs.digests.of(path)
     return digests
 
 

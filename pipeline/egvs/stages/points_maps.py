@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
 
 from egvs.core.grid import Grid
 from egvs.scoring.points_map import TARGETS, PointsMap, TargetPositions
 from egvs.scoring.targets import detection_probability
 from egvs.scoring.visibility import Beams
 from egvs.stages.base import StageContext
-
-
-class SitePointsMap(NamedTuple):
-    """The map of one target from one site."""
-
-    site: str
-    points: PointsMap
 
 
 def target_positions(context: StageContext, grid: Grid) -> tuple[TargetPositions, ...]:
@@ -37,10 +29,10 @@ def target_positions(context: StageContext, grid: Grid) -> tuple[TargetPositions
 
 def points_maps(
     context: StageContext, positions: Iterable[TargetPositions], scans: Iterable[tuple[str, Beams]]
-) -> Iterator[SitePointsMap]:
-    """Yield the map of each target from each of some named scans."""
+) -> Iterator[tuple[str, PointsMap]]:
+    """Yield the map of each target from each of some named scans, with the name."""
     positions = tuple(positions)
     for name, beams in scans:
         probability = detection_probability(context.scene, beams.sensor)
         for positions_of_target in positions:
-            yield SitePointsMap(name, positions_of_target.points_map(beams, probability))
+            yield name, positions_of_target.points_map(beams, probability)

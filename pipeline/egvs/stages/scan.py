@@ -24,7 +24,7 @@ from egvs.sensors.scanner import Scan, Scanner
 from egvs.sensors.sites import ScannedSite
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.blocked_sites import near_share, warn_blocked_sites
-from egvs.stages.scene_inputs import scan_dependencies
+from egvs.stages.scene_dependencies import scan_dependencies
 
 
 def dependencies(context: StageContext) -> StageDependencies:
@@ -143,4 +143,4 @@ def _write_cloud(folder: RunFolder, site: str, scan: Scan, suffix: str) -> str:
     return name
 
 
-STAGE = Stage("scan", __name__, dependencies, run, reads=(RunFolder.statics,))
+STAGE = Stage("scan", __name__, dependencies, run, reads=(RunFolder.statics,), code=("egvs.stages.scene_inputs",))

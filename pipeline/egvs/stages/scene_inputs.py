@@ -1,4 +1,4 @@
-"""The scene of a scenario, and what empty scans of it depend on.
+"""The scene of a scenario: its sites, sensors and effects in the static world.
 
 Steps: read or generate the candidate sites; drop generated ones where no pole can stand; keep the effects of the scan
 and score stages that can change a result.
@@ -6,25 +6,16 @@ and score stages that can change a result.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
-from egvs.artefacts.run_folder import RunFolder
-from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.effects import registry
-from egvs.effects.base import Effect
-from egvs.formats import point_clouds, vector_files
 from egvs.scenario.model import Scenario
-from egvs.sensors import sensor, site_feasibility, sites
+from egvs.sensors import site_feasibility, sites
 from egvs.sensors.scene import InactiveEffect, Scene
 from egvs.sensors.site_feasibility import SiteSelection
 from egvs.sensors.sites import Site
-from egvs.stages.base import StageContext, StageDependencies
 from egvs.traffic import sumo_folder
-from egvs.world import geolocation
 from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
 
@@ -95,64 +86,3 @@ def with_effects(plain: Scene) -> Scene:
         elif reason:
             inactive.append(InactiveEffect(effect.NAME, effect.STAGE, reason))
     return replace(plain, effects=tuple(active), inactive_effects=tuple(inactive))
-
-
-def scan_dependencies(context: StageContext) -> StageDependencies:
-    """What empty scans depend on: the region without its voxels, sites, sensors and effects; files by sha256."""
-    scenario = context.scenario
-    scene = context.scene
-    active = scene.acting(Effect, "scan")
-    settings: dict[str, Any] = {
-        "name": scenario.name,
-        "roi": [scene.roi.origin_m, scene.roi.size_m],
-        "ground": scenario.statics.ground,
-        "sites": scenario.sites.model_dump(mode="json"),
-        "sensors": sensor_settings(scenario),
-    }
-    settings |= geolocation.world_frame_settings(scenario)
-    if scenario.crs.zero_height_m:
-        settings["zero_height_m"] = scenario.crs.zero_height_m
-    if active:
-        settings["effects"] = registry.effect_settings(active)
-    if scene.dropped:
-        settings["dropped"] = [site.name for site, _ in scene.dropped]
-
-    digests = context.digests(RunFolder.statics.name) | site_digests(scenario, scene.sites)
-    readers = set()
-    for site in scene.sites:
-        if site.points:
-            readers.add(point_clouds.format_of_file(Path(site.points), f"site {site.name}: points"))
-    return StageDependencies(settings, digests, modules=(*registry.effect_modules(active), *sorted(readers)))
-
-
-def sensor_settings(scenario: Scenario) -> dict[str, Any]:
-    """The user's sensors by name, without range noise: empty scans and scores are computed without it."""
-    noise = {"range_sigma_m"}
-    return {name: model.model_dump(mode="json", exclude=noise) for name, model in scenario.sensors.items()}
-
-
-def site_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:
-    """Return the sha256 of the sites file, of measured scans, and of the data of sensors."""
-    sites = tuple(sites)
-    digests = {}
-    if scenario.sites.file is not None:
-        path = scenario.find(scenario.sites.file, "sites.file")
-        digests[scenario.sites.file] = files.hash_file(path)
-        for part in vector_files.companion_files(path):
-            digests[f"sites.file: {part.name}"] = files.hash_file(part)
-    for site in sites:
-        if site.points is not None:
-            digests[site.points] = files.hash_file(scenario.find(site.points, f"site {site.name}: points"))
-    return digests | sensor_digests(scenario, sites)
-
-
-def sensor_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:
-    """Return the sha256 of the beam tables of the user's sensors, and of the catalogue entries of the others."""
-    digests = {}
-    for name in dict.fromkeys(site.sensor for site in sites):
-        config = scenario.sensors.get(name)
-        if config is not None and config.beams is not None:
-            digests[config.beams] = files.hash_file(scenario.find(config.beams, f"sensors.{name}.beams"))
-        elif config is None and name in sensor.catalogue_entries():
-            digests[f"catalogue: {name}"] = sensor.catalogue_digest(name)
-    return digests

@@ -31,7 +31,7 @@ from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.blocked_sites import warn_blocked_sites
-from egvs.stages.scene_inputs import scan_dependencies, sensor_digests, sensor_settings
+from egvs.stages.scene_dependencies import scan_dependencies, sensor_digests, sensor_settings
 from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring
 from egvs.world import clearances, geolocation
 
@@ -65,7 +65,7 @@ def dependencies(context: StageContext) -> StageDependencies:
     if scenario.score.blindspots or scenario.score.zones is not None:
         network = context.inputs.common_network_path
         if network is not None:
-            digests["network"] = context.inputs.digest(network)
+            digests["network"] = context.inputs.digests.of(network)
     if effects:
         settings["effects"] = registry.effect_settings(effects)
         settings["sensors"] = sensor_settings(scenario)
@@ -355,6 +355,7 @@ STAGE = Stage(
     run,
     reads=(RunFolder.tpog, RunFolder.trajectories, RunFolder.scans, RunFolder.statics),
     effect_stages=("scan", "score"),
+    code=("egvs.stages.scene_inputs",),
     neutral_options=("scored_elsewhere",),
     prepare=(site_scoring.prepare_targets, site_scoring.prepare_voxels),
 )

@@ -12,8 +12,6 @@ from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core.errors import InputError
 from egvs.scoring.visibility import Beams
-from egvs.sensors.scanner import Scanner
-from egvs.sensors.scene import Scene
 from egvs.sensors.sites import ScannedSite
 from egvs.stages.base import StageContext
 
@@ -64,15 +62,7 @@ def read_scans(context: StageContext, path: Path, only: Collection[str] | None =
 
 
 def _cast_scans(context: StageContext, only: Collection[str] | None) -> Iterator[SiteScan]:
-    scanner = context.remember("scanner", (RunFolder.statics.name,), lambda: _make_scanner(context.scene))
     for site in context.scene.sites:
         if only is None or site.name in only:
-            scan = scanner.scan_site(site)
+            scan = context.inputs.scanner.scan_site(site)
             yield SiteScan(scan.as_site(site.name, site.pole), Beams.of(scan))
-
-
-def _make_scanner(scene: Scene) -> Scanner:
-    """Make the scanner of a scene, and check the pose of each site."""
-    scanner = Scanner(scene)
-    scanner.check(scene.sites)
-    return scanner

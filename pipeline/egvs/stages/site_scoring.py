@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from egvs.scoring.egvs import EntropyField
 from egvs.scoring.road_locations import RoadLocations
 from egvs.scoring.score_table import MIX, ScoreTable, SiteScores
 from egvs.scoring.scorer import PeriodTpog, Scorer, SiteScore
-from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, detector_groups, means_without_each
+from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, detector_groups
 from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, SiteTargetScores, expected_by_detector
 from egvs.scoring.targets import (
     FrameGroups,
@@ -55,6 +55,7 @@ from egvs.sensors.sites import Pose, ScannedSite
 from egvs.stages.base import StageContext
 from egvs.stages.blocked_sites import near_share
 from egvs.stages.site_scans import SiteScan, empty_scans
+from egvs.statistics.blocks import means_without_each
 from egvs.world.carriageway import Carriageway
 
 if TYPE_CHECKING:
@@ -112,13 +113,6 @@ def zone_users(context: StageContext) -> ZoneUsers:
     period = _period_of_rows(record, recorded)
     detectors = context.scenario.score.detectors
     return ZoneUsers.of(record, reported_zones(context.scenario), weight, period, carriageway, detectors)
-
-
-class _PeriodRows(NamedTuple):
-    """The vehicle-frames of one period."""
-
-    period: str
-    rows: slice
 
 
 class TargetScorer:
@@ -256,14 +250,14 @@ class TargetScorer:
 
 def _rows_of_periods(
     periods: Sequence[PeriodBlocks], recorded: Sequence[int], record: TargetRecord
-) -> tuple[_PeriodRows, ...]:
-    """The vehicle-frames of each period; nothing where there are no periods."""
+) -> tuple[tuple[str, slice], ...]:
+    """Name and vehicle-frames of each period; nothing where there are no periods."""
     first_frames = np.append(0, np.cumsum(recorded))
     ends: list[int] = np.searchsorted(record.numbers[record.frame], first_frames).tolist()
     rows = []
     for period, start, end in zip(periods, ends[:-1], ends[1:], strict=True):
         if period.name:
-            rows.append(_PeriodRows(period.name, slice(start, end)))
+            rows.append((period.name, slice(start, end)))
     return tuple(rows)
 
 

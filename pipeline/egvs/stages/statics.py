@@ -24,9 +24,9 @@ def dependencies(context: StageContext) -> StageDependencies:
     for key in ("footprints", "polygons"):
         for name in getattr(config, key):
             path = scenario.find(name, f"statics.{key}")
-            digests[name] = context.inputs.digest(path)
+            digests[name] = context.inputs.digests.of(path)
             for part in vector_files.companion_files(path):
-                digests[f"statics.{key}: {part.name}"] = context.inputs.digest(part)
+                digests[f"statics.{key}: {part.name}"] = context.inputs.digests.of(part)
     for mesh in config.meshes:
         digests |= mesh_digests(scenario.find(mesh.file, "statics.meshes"), mesh.file)
     modules: tuple[str, ...] = ()
@@ -35,9 +35,9 @@ def dependencies(context: StageContext) -> StageDependencies:
         modules = (type(ground).__module__,)
         network = sumo_folder.network_path(scenario)
         if network is not None:
-            digests["surface"] = context.inputs.digest(network)
+            digests["surface"] = context.inputs.digests.of(network)
         if config.terrain is not None:
-            digests["terrain"] = context.inputs.digest(scenario.find(config.terrain, TERRAIN_KEY))
+            digests["terrain"] = context.inputs.digests.of(scenario.find(config.terrain, TERRAIN_KEY))
     box = scenario.roi.box
     settings = {"name": scenario.name, "statics": config.model_dump(mode="json"), "roi": [box.origin_m, box.size_m]}
     settings |= geolocation.world_frame_settings(scenario)

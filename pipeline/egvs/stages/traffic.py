@@ -18,13 +18,12 @@ from contextlib import ExitStack
 from contextvars import copy_context
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY
-from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, InputError, MissingBackendError
 from egvs.core.platform import relative_path
 from egvs.core.progress import SummedProgress
@@ -71,10 +70,10 @@ def dependencies(context: StageContext) -> StageDependencies:
 
     digests = {}
     if scenario.statics.terrain is not None:
-        digests["terrain"] = context.inputs.digest(scenario.find(scenario.statics.terrain, TERRAIN_KEY))
+        digests["terrain"] = context.inputs.digests.of(scenario.find(scenario.statics.terrain, TERRAIN_KEY))
     for period_scenario in periods:
         for path in _source_files(period_scenario):
-            digests[_relative_name(path, scenario)] = context.inputs.digest(path)
+            digests[_relative_name(path, scenario)] = context.inputs.digests.of(path)
     needs_sumo = any(not period.traffic.is_finished or period.traffic.vtypes for period in periods)
     versions = {"sumo": sumo.sumo_version() if needs_sumo else None}
     if scenario.is_recorded:
@@ -90,7 +89,6 @@ def _installed_sumo_version() -> str | None:
     try:
         return sumo.sumo_version()
     except MissingBackendError:
-        files.tell_observers(None)  # SUMO may be installed later
         return None
 
 
@@ -227,11 +225,13 @@ def _record_period(
     with ExitStack() as simulations:
         for number, recorded in enumerate(_record_runs(context, runs, period, effects, traci, simulations), start=1):
             prefix = f"{number}:" if len(runs) > 1 else ""
-            written = _write_run(context, runs[number - 1], recorded, effects, file, first_frame + frames, prefix)
+            summary, unknown_boxes = _write_run(
+                context, runs[number - 1], recorded, effects, file, first_frame + frames, prefix
+            )
             if notes:
-                written.summary["notes"] = [*written.summary.get("notes", []), *notes]
-            summaries.append(written.summary)
-            unknown += written.unknown_boxes
+                summary["notes"] = [*summary.get("notes", []), *notes]
+            summaries.append(summary)
+            unknown += unknown_boxes
             frames += recorded.window.count
             window = replace(recorded.window, count=frames)
     if len(runs) == 1:
@@ -269,13 +269,6 @@ def _record_runs(
     yield from map_ordered(lambda number: contexts[number].run(record, number), range(len(runs)), threads)
 
 
-class _WrittenRun(NamedTuple):
-    """What happened in a simulation whose frames were written, and where positions are unknown."""
-
-    summary: Summary
-    unknown_boxes: list[dict[str, Any]]
-
-
 def _write_run(
     context: StageContext,
     scenario: Scenario,
@@ -284,8 +277,8 @@ def _write_run(
     file: parquet.ArtefactWriter,
     first_frame: int,
     name_prefix: str,
-) -> _WrittenRun:
-    """Write the frames of one simulation, or of a finished file."""
+) -> tuple[Summary, list[dict[str, Any]]]:
+    """Write the frames of one simulation, or of a finished file; return its summary, and the unknown positions."""
     tally, reports = trajectories.write_trajectories(
         scenario, recorded, effects, file, context.progress, first_frame, name_prefix
     )
@@ -301,7 +294,7 @@ def _write_run(
     warnings = [*recorded.warnings, *warnings]
     summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *(warning.to_json() for warning in warnings)]
     unknown = [{**gap, "frames": [first_frame + frame for frame in gap["frames"]]} for gap in recorded.unknown_boxes]
-    return _WrittenRun(summary | reports, unknown)
+    return summary | reports, unknown
 
 
 def merge_summaries(summaries: dict[str, Summary]) -> Summary:

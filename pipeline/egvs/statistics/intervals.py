@@ -1,24 +1,36 @@
-"""Standard errors and 95 % intervals of shares and of scales, from blocks of neighbouring pulses.
+r"""Values with 95 % intervals.
 
-Neighbouring pulses meet the same surface and, in second differences, share returns. So the variance of a sum is
-estimated from sums over blocks of consecutive pulses (the delete-one-block jackknife: Künsch 1989, Ann. Statist. 17,
-1217-1241), and the interval uses Student's t with as many degrees of freedom as there are blocks, less one.
+Of independent observations, a count of k has the exact interval of a Poisson mean, from
+:math:`\chi^2_{0.025}(2 k) / 2` to :math:`\chi^2_{0.975}(2 k + 2) / 2` (Garwood 1936), a share that of Clopper and
+Pearson (1934), a mean Student's, a standard deviation that of chi-squared, and a median the distribution-free one of
+order statistics.
+
+Shares and scales of laser pulses have intervals from blocks. Neighbouring pulses meet the same surface and, in second
+differences, share returns. So the variance of a sum is estimated from sums over blocks of consecutive pulses (the
+delete-one-block jackknife: Künsch 1989, Ann. Statist. 17, 1217-1241), and the interval uses Student's t with as many
+degrees of freedom as there are blocks, less one.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.stats import beta, binom, chi2, norm, t
 
 from egvs.core.grid import FloatArray
+from egvs.statistics.blocks import jackknife_variance
 
 BLOCKS = 40
 """Number of blocks, where there are enough values."""
 MIN_VALUES = 100
-"""Fewer values give no estimate."""
+"""Fewer values give no estimate from blocks."""
+MIN_OBSERVATIONS = 20
+"""Fewer independent observations give a value that is not used."""
+
+_LEVEL = 0.95
 
 _CLIP = 3.0
 _INSIDE = float(1.0 - 2.0 * norm.sf(_CLIP))
@@ -32,7 +44,7 @@ class Estimate(NamedTuple):
     Attributes
     ----------
     value, se
-        The value and its standard error.
+        The value and its standard error; NaN where only the interval is known.
     low, high
         Ends of the interval.
     n
@@ -44,6 +56,64 @@ class Estimate(NamedTuple):
     low: float
     high: float
     n: int
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether there are at least :data:`MIN_OBSERVATIONS`."""
+        return self.n >= MIN_OBSERVATIONS
+
+    def format(self, digits: int = 2, unit: str = "") -> str:
+        """Return the interval as text: "95 %: 1.9 to 2.3 s, from 31"."""
+        space = " " if unit else ""
+        return f"95 %: {self.low:.{digits}f} to {self.high:.{digits}f}{space}{unit}, from {self.n:,}"
+
+
+def poisson_interval(count: int) -> tuple[float, float]:
+    """Return the exact 95 % interval of the mean of a Poisson distribution from which a count was drawn."""
+    tail = (1.0 - _LEVEL) / 2.0
+    low = float(chi2.ppf(tail, 2 * count)) / 2.0 if count else 0.0
+    return low, float(chi2.ppf(1.0 - tail, 2 * count + 2)) / 2.0
+
+
+def share_interval(count: int, total: int) -> tuple[float, float]:
+    """Return the exact 95 % interval of a share (Clopper and Pearson 1934)."""
+    tail = (1.0 - _LEVEL) / 2.0
+    low = float(beta.ppf(tail, count, total - count + 1)) if count else 0.0
+    high = float(beta.ppf(1.0 - tail, count + 1, total - count)) if count < total else 1.0
+    return low, high
+
+
+def median_of(values: Sequence[float] | FloatArray) -> Estimate | None:
+    """Return the median with the interval of order statistics; None without values."""
+    ordered = np.sort(np.asarray(values, dtype=np.float64))
+    n = ordered.size
+    if not n:
+        return None
+    rank = max(int(binom.ppf((1.0 - _LEVEL) / 2.0, n, 0.5)), 1)
+    return Estimate(float(np.median(ordered)), math.nan, float(ordered[rank - 1]), float(ordered[n - rank]), n)
+
+
+def mean_of(values: Sequence[float] | FloatArray) -> Estimate | None:
+    """Return the mean with Student's interval; None with fewer than two values."""
+    numbers = np.asarray(values, dtype=np.float64)
+    n = numbers.size
+    if n < 2:
+        return None
+    deviation = numbers.std(ddof=1)
+    half = float(t.ppf(0.5 + _LEVEL / 2.0, n - 1) * deviation / math.sqrt(n))
+    mean = float(numbers.mean())
+    return Estimate(mean, float(deviation / math.sqrt(n)), mean - half, mean + half, n)
+
+
+def deviation_of(values: Sequence[float] | FloatArray) -> Estimate | None:
+    """Return the standard deviation with the interval for normal values; None with fewer than two values."""
+    numbers = np.asarray(values, dtype=np.float64)
+    n = numbers.size
+    if n < 2:
+        return None
+    deviation, tail = float(numbers.std(ddof=1)), (1.0 - _LEVEL) / 2.0
+    low, high = (deviation * math.sqrt((n - 1) / chi2.ppf(share, n - 1)) for share in (1.0 - tail, tail))
+    return Estimate(deviation, math.nan, float(low), float(high), n)
 
 
 def estimate_share(hits: FloatArray, inflation: float = 1.0) -> Estimate:
@@ -63,7 +133,7 @@ def estimate_share(hits: FloatArray, inflation: float = 1.0) -> Estimate:
     if binomial > 0.0 and n >= MIN_VALUES:
         counts, sums = _block_sums(np.column_stack([np.ones(n), hits])).T
         left_out = (sums.sum() - sums) / (counts.sum() - counts)
-        factor = max(factor, jackknife_variance(left_out) / binomial)
+        factor = max(factor, float(jackknife_variance(left_out)) / binomial)
     effective = n / factor
     z = float(norm.ppf(0.975))
     centre = (share + z * z / (2 * effective)) / (1 + z * z / effective)
@@ -130,9 +200,3 @@ def _block_sums(values: FloatArray) -> FloatArray:
     starts = np.linspace(0, len(values), min(BLOCKS, len(values)), endpoint=False).astype(np.int64)
     sums: FloatArray = np.add.reduceat(values.astype(np.float64), starts, axis=0)
     return sums
-
-
-def jackknife_variance(left_out: FloatArray) -> float:
-    """Return the variance of an estimate from its values without each of k blocks in turn, (k,)."""
-    k = len(left_out)
-    return float((k - 1) / k * ((left_out - left_out.mean()) ** 2).sum())

@@ -32,12 +32,12 @@ from egvs.effects.articulated import Articulated
 from egvs.effects.base import Detect, Echo, Effect, Traffic
 from egvs.results.labels import SCORE_LABELS, ScoreLabel
 from egvs.runs import run, stage_keys, stage_registry
+from egvs.runs.run_context import open_folder
 from egvs.runs.stage_registry import RANKING_STAGES
 from egvs.scenario.effects_config import GROUP, EffectParameters
 from egvs.scenario.model import Scenario
 from egvs.sensors.scene import Scene
-from egvs.stages import inputs
-from egvs.stages.inputs import build_scene, open_folder
+from egvs.stages.inputs import build_scene
 from egvs.stages.site_scoring import SiteScoring
 from egvs.studies.measurement import scenario_dependencies
 from egvs.studies.study_settings import SCENARIO, WITH_PREFIX, WITHOUT_PREFIX
@@ -224,7 +224,7 @@ class EffectTrials:
         only_score = {"others": (), "blindspots": False, "standard_error": False, "keep_visibility": ()}
         score = scenario.score.model_copy(update=only_score)
         scan = scenario.scan.model_copy(update={"keep": False})
-        context = inputs.open_folder(scenario.model_copy(update={"score": score, "scan": scan}), self._folder)
+        context = open_folder(scenario.model_copy(update={"score": score, "scan": scan}), self._folder)
         scoring = SiteScoring(context)
         table = scoring.score_table(scoring.all_sites([site.name for site in self._sites]))
         return table.column(score.rank_by).values

@@ -28,6 +28,7 @@ from egvs.core.progress import ProgressCallback
 from egvs.core.resource_usage import ResourceUsage, release_memory
 from egvs.runs import stage_keys, stage_registry
 from egvs.runs.run import fetch_or_run
+from egvs.runs.run_context import open_folder
 from egvs.runs.run_sources import SettingsSource
 from egvs.runs.stage_keys import StageKey
 from egvs.runs.stage_registry import RANKING_STAGES, StageResult
@@ -35,8 +36,7 @@ from egvs.runs.store import Store
 from egvs.scenario.model import Scenario, SiteGrid
 from egvs.sensors import sites
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import open_folder
-from egvs.stages.scene_inputs import site_digests
+from egvs.stages.scene_dependencies import site_digests
 from egvs.studies.study_settings import Setting
 
 STUDY_FOLDER = "accuracy"

@@ -27,11 +27,11 @@ from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.results.ranking import RankedSite
 from egvs.results.sensors import ScoreDifference
+from egvs.runs.run_context import open_folder
 from egvs.runs.stage_registry import recorded_digests
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scoring.score_table import ScoreColumn
 from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty
-from egvs.stages.inputs import open_folder
 from egvs.stages.site_scoring import SiteScoring
 
 
@@ -45,13 +45,6 @@ class SiteOfRun(NamedTuple):
 class _SiteKey(NamedTuple):
     folder: Path
     name: str
-
-
-class _PoolKey(NamedTuple):
-    """Traffic, and frames of each group of each record: sites with the same key have paired replicates."""
-
-    traffic: str
-    frames: tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +96,8 @@ class ScoreDifferences:
         for folder, site in sites:
             recorded.setdefault(folder, {})[site.site] = site
         differences = cls({folder: traffic_digest(folder) for folder in recorded})
-        pools: dict[_PoolKey, dict[Path, SiteReplicates]] = {}
+        # by traffic and frames of each group of each record: sites for which both are the same have paired replicates
+        pools: dict[tuple[str, tuple[tuple[int, ...], ...]], dict[Path, SiteReplicates]] = {}
         for number, (folder, sites_of_run) in enumerate(recorded.items(), start=1):
             digest = differences._traffic[folder]
             if differences._count_sites(digest, recorded) > 1:
@@ -112,7 +106,7 @@ class ScoreDifferences:
                     differences._failures[folder] = result
                 else:
                     frames = tuple(tuple(record.frames.tolist()) for record in result.groups)
-                    pools.setdefault(_PoolKey(digest, frames), {})[folder] = result
+                    pools.setdefault((digest, frames), {})[folder] = result
             progress("runs", number, len(recorded))
         for members in pools.values():
             differences._add_pool(members)

@@ -43,11 +43,11 @@ from egvs.drawing.maps import Backdrop
 from egvs.drawing.svg_figures import extent
 from egvs.extensions.tracks import recorded_tracks
 from egvs.results.ranking import RankedSite, Ranking
+from egvs.runs.run_context import open_folder
 from egvs.runs.stage_registry import recorded_digests
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import open_folder
 from egvs.statistics.ranks import rank_agreement, regret
 from egvs.studies import lane_speeds
 from egvs.studies.lane_bins import LaneBins, column_centres_m, lane_bins, lane_distances, mean_groups, sum_groups

@@ -22,12 +22,12 @@ from egvs.artefacts.tpog import PeriodBlocks, Tpog, block_multiplicities, read_p
 from egvs.artefacts.traffic_frames import spaced_frames
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.threads import map_ordered
+from egvs.runs.run_context import open_folder
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring.scorer import PeriodTpog, Scorer, SiteScore
 from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, expected_by_detector
 from egvs.scoring.targets import recorded_frames
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import open_folder
 from egvs.stages.site_scans import SiteScan, empty_scans
 from egvs.stages.site_scoring import TargetScorer
 

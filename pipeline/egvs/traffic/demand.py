@@ -762,13 +762,6 @@ def _follow(towards: IntArray, start: int, end: int) -> list[int]:
     return way
 
 
-class _SampledRoute(NamedTuple):
-    """A departure in seconds, and ids of edges."""
-
-    depart_s: float
-    edges: list[str]
-
-
 @dataclass(frozen=True)
 class _SampledVehicle:
     """A vehicle of the counted traffic."""
@@ -828,12 +821,12 @@ def write_routes(
         finder = finders[_main_kind(kinds).vclass]
         candidates = finder.candidates([location for location, _ in counts], traffic, rng, where)
         routes = _sample_routes(counts, candidates, times_s, sampler_seed, path.parent)
-        for index, route in enumerate(routes):
-            able = [kind for kind in kinds if finders[kind.vclass].may_drive(route.edges)]  # the main kind always is
+        for index, (depart_s, edges) in enumerate(routes):
+            able = [kind for kind in kinds if finders[kind.vclass].may_drive(edges)]  # the main kind always is
             shares = np.array([kind.share for kind in able])
             kind = able[int(np.searchsorted(np.cumsum(shares) / shares.sum(), rng.random(), side="right"))]
             name = f"{group or FLEET}.{index}"
-            vehicles.append(_SampledVehicle(route.depart_s, name, kind.name, " ".join(route.edges)))
+            vehicles.append(_SampledVehicle(depart_s, name, kind.name, " ".join(edges)))
 
     vehicles.sort(key=lambda vehicle: (vehicle.depart_s, vehicle.name))
     files.write_text(path, _xml_document("routes", [vehicle.xml() for vehicle in vehicles]))
@@ -895,8 +888,8 @@ def _main_kind(kinds: Sequence[VehicleKind]) -> VehicleKind:
 def _sample_routes(
     counts: Sequence[tuple[CountLocation, float]], candidates: Sequence[tuple[str, ...]],
     times_s: tuple[float, float], seed: int, folder: Path,
-) -> Iterator[_SampledRoute]:  # fmt: skip
-    """Run routeSampler on counts (location, vehicles per hour); yield a route for each vehicle."""
+) -> Iterator[tuple[float, list[str]]]:  # fmt: skip
+    """Run routeSampler on counts (location, vehicles per hour); yield departure (s) and edges of each vehicle."""
     begin, end = (f"{time_s:.3f}" for time_s in times_s)
     duration_s = times_s[1] - times_s[0]
     routes = [f'    <route id="{index}" edges={quoteattr(" ".join(edges))}/>' for index, edges in enumerate(candidates)]
@@ -920,6 +913,6 @@ def _sample_routes(
 
     for vehicle in xml.iter_elements(folder / SAMPLED_ROUTES_FILE, "routes"):
         for route in vehicle.iter("route"):
-            yield _SampledRoute(float(vehicle.get("depart", "0")), route.get("edges", "").split())
+            yield float(vehicle.get("depart", "0")), route.get("edges", "").split()
     for name in (CANDIDATE_ROUTES_FILE, COUNTS_FILE, SAMPLED_ROUTES_FILE):
         (folder / name).unlink()

@@ -241,20 +241,13 @@ class WatchedRegion(NamedTuple):
     near: Roi | None = None
 
 
-class SumoFiles(NamedTuple):
-    """Files that SUMO writes: FCD as CSV, and its log."""
-
-    fcd: Path
-    log: Path
-
-
 class RegionWatch:
     """Watches regions while SUMO writes its files, and raises an error as soon as all of them are locked.
 
     Parameters
     ----------
-    files
-        Files that SUMO writes.
+    fcd, log
+        Files that SUMO writes: FCD as CSV, and its log.
     timing
         Times of the simulation.
     regions
@@ -275,11 +268,11 @@ class RegionWatch:
     """
 
     def __init__(
-        self, files: SumoFiles, timing: Timing, regions: Mapping[str, WatchedRegion], roads: Network,
+        self, fcd: Path, log: Path, timing: Timing, regions: Mapping[str, WatchedRegion], roads: Network,
         sizes: Mapping[str, VehicleSize], demand: DemandKey, teleport_s: float | None = None,
     ) -> None:  # fmt: skip
         self.locked: dict[str, str] = {}
-        self._fcd, self._log = files
+        self._fcd, self._log = fcd, log
         self._first_ms = timing.first_ms
         self._sample_ms = timing.period_ms * max(1, round(SAMPLE_S * 1000 / timing.period_ms))
         self._regions, self._roads, self._sizes = regions, roads, sizes

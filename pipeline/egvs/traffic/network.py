@@ -22,7 +22,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core import files
+from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.formats import xml
 from egvs.scenario.fields import parse_coordinate_m
@@ -346,7 +346,7 @@ def read_net_xml(path: Path, name: Path | None = None) -> Network:
     InputError
         When the file is not a SUMO network, is damaged, or has no road.
     """
-    return _read_network_file(_NamedFile(name or path, path), files.hash_file(path))
+    return _read_network_file(_NamedFile(name or path, path), hash_input(path))
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.traffic import fcd, finished_fcd, locks, network, sumo, sumo_folder
 from egvs.traffic.count_fit import CountFit, count_fits, missed_count_warnings
-from egvs.traffic.locks import DemandKey, RegionWatch, SumoFiles, WatchedRegion, describe_distance
+from egvs.traffic.locks import DemandKey, RegionWatch, WatchedRegion, describe_distance
 from egvs.traffic.sumo_folder import SimulationFolder, Timing
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
 
@@ -243,11 +243,11 @@ def _record_simulated(
             sizes |= extension.sizes()
         watch = None
         if regions and prepared.is_generated:
-            files = SumoFiles(folder / sumo_folder.FCD_FILE, folder / sumo_folder.LOG_FILE)
+            fcd, log = folder / sumo_folder.FCD_FILE, folder / sumo_folder.LOG_FILE
             watch = RegionWatch(
-                files, prepared.timing, regions, prepared.roads, sizes, demand_key(scenario), prepared.teleport_s
+                fcd, log, prepared.timing, regions, prepared.roads, sizes, demand_key(scenario), prepared.teleport_s
             )
-        cost = simulate(prepared, progress, watch)
+        seconds, peak_mb = simulate(prepared, progress, watch)
     except sumo.SumoInputError as error:
         hint = "Correct these files; SUMO read copies of them."
         raise InputError(where, f"SUMO cannot run {sources}: {error}", hint) from None
@@ -262,7 +262,7 @@ def _record_simulated(
         ]
         flags = sumo_folder.as_flags(prepared.options | prepared.outputs)
         summary = RecordingSummary(
-            sumo.sumo_version(), cost.seconds, flags, len(collisions), len(teleports), cost.peak_mb, prepared.notes,
+            sumo.sumo_version(), seconds, flags, len(collisions), len(teleports), peak_mb, prepared.notes,
             fits, warnings,
         )  # fmt: skip
         persons = _read_rows(folder / sumo_folder.PERSONS_FILE, "person") if prepared.has_extra_traffic else None
@@ -518,17 +518,10 @@ def _demand_key(scenario: Scenario, key: str, hint: str) -> DemandKey:
     return DemandKey(where, hint)
 
 
-class SimulationCost(NamedTuple):
-    """Duration of a simulation, and the peak memory of SUMO (MB of 2**20 bytes; None where it is not known)."""
-
-    seconds: float
-    peak_mb: float | None
-
-
 def simulate(
     prepared: SimulationFolder, progress: ProgressCallback, region_watch: RegionWatch | None = None
-) -> SimulationCost:
-    """Run SUMO.
+) -> tuple[float, float | None]:
+    """Run SUMO; return its seconds, and its peak memory (MB of 2**20 bytes; None where it is not known).
 
     Parameters
     ----------
@@ -565,7 +558,7 @@ def simulate(
     if region_watch is not None:
         region_watch.finish()
     peak_mb = round(max(peaks_mb), 1) if peaks_mb else None
-    return SimulationCost(round(perf_counter() - start, 3), peak_mb)
+    return round(perf_counter() - start, 3), peak_mb
 
 
 def check_complete(prepared: SimulationFolder) -> None:

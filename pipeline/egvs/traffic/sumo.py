@@ -27,7 +27,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
 
-from egvs.core import files, sandbox
+from egvs.core import sandbox
 from egvs.core.child_process import Confinement, start_program
 from egvs.core.errors import InputError, MissingBackendError, RunError
 from egvs.core.sumo_home import sumo_home
@@ -112,25 +112,17 @@ def sumo_environment() -> dict[str, str]:
     return {**defaults, **os.environ}
 
 
+@cache
 def sumo_version() -> str:
     """Return SUMO's version, e.g. ``"1.28.0"``: that of the wheel, or what ``sumo --version`` prints."""
-    version, is_wheel = _installed_version()
-    if not is_wheel:
-        files.observe_content(sumo_binary("sumo"))
-    return version
-
-
-@cache
-def _installed_version() -> tuple[str, bool]:
-    """Return SUMO's version, and whether it is that of the wheel."""
     program = sumo_binary("sumo")
     try:
         wheel = metadata.distribution("eclipse-sumo")
         if Path(str(wheel.locate_file("sumo"))).resolve() in program.resolve().parents:
-            return wheel.version, True
+            return wheel.version
     except metadata.PackageNotFoundError:
         pass
-    return parse_version(run_program("sumo", ["--version"], Path())), False
+    return parse_version(run_program("sumo", ["--version"], Path()))
 
 
 def parse_version(text: str) -> str:
@@ -413,7 +405,10 @@ def _attach(process: subprocess.Popen[bytes], port: int) -> Any:
 
 
 def _connect(host: str, port: int) -> Any:
-    """Return a connection, or None where no server listens."""
+    """Return a connection, or None where no server listens.
+
+    Its socket is reached by a private name, here and above: traci has no other way to set a time limit.
+    """
     import traci
 
     default_s = socket.getdefaulttimeout()

@@ -21,6 +21,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from egvs.core import files
+from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import number_of
@@ -512,7 +513,7 @@ _CONVERSION_LOCK = threading.Lock()
 def convert_osm_to_network(path: Path, network_path: Path) -> None:
     """Convert an OpenStreetMap map to a network, whose origin is at its south-west corner."""
     with _CONVERSION_LOCK:
-        content = _convert_osm_once(path, files.hash_file(path))
+        content = _convert_osm_once(path, hash_input(path))
     with files.attach_filename(network_path):
         network_path.write_bytes(content)
 

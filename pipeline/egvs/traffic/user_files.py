@@ -28,6 +28,7 @@ from xml.etree.ElementTree import Element, tostring
 from xml.sax.saxutils import quoteattr
 
 from egvs.core import files
+from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.formats import xml
 
@@ -214,7 +215,7 @@ def read_sumocfg(path: Path) -> DemandFiles:
         elif option in FILE_OPTIONS:
             paths[option] = tuple(path.parent / name.strip() for name in value.split(",") if name.strip())
             for file in paths[option]:
-                if not files.is_input_file(file):
+                if not file.is_file():
                     raise InputError(where, f"no such file ({file})", "Use a path relative to the configuration.")
         elif option in ACCEPTED_OPTIONS:
             options[option] = value
@@ -272,7 +273,7 @@ def copy_checked(path: Path, to: Path) -> list[str]:
     InputError
         When the file is not well-formed, declares entities, or names a further file that SUMO would read.
     """
-    outputs = _count_outputs(path, files.hash_file(path))
+    outputs = _count_outputs(path, hash_input(path))
     with files.atomic_write(to) as partial, partial.open("wb") as file:
         if outputs or xml.file_encoding(path) not in ("utf-8", "ascii"):
             _rewrite(path, file)
@@ -287,7 +288,7 @@ def copy_checked(path: Path, to: Path) -> list[str]:
 
 def check_copyable(path: Path) -> None:
     """Raise the InputError of :func:`copy_checked`, if any."""
-    _count_outputs(path, files.hash_file(path))
+    _count_outputs(path, hash_input(path))
 
 
 @lru_cache(maxsize=32)

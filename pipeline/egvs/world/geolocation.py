@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from egvs.core import files
+from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.formats.georeference import MAX_SCALE_ERROR, Georeference, WorldFrame, utm_epsg
 from egvs.scenario.model import Scenario
@@ -68,7 +69,7 @@ def world_frame_settings(scenario: Scenario) -> dict[str, Any]:
         settings["crs"] = [scenario.crs.epsg, *scenario.crs.offset_m]
     path = _network_path(scenario)
     if path is not None and network.is_osm(path):
-        settings |= {"map": files.hash_file(path), "sumo": sumo.sumo_version()}
+        settings |= {"map": hash_input(path), "sumo": sumo.sumo_version()}
     elif path is not None:
         location = network.read_location(path)
         if location is not None and location.projection not in _NO_PROJECTION:

@@ -20,9 +20,9 @@ from egvs.placement import problem_builder
 from egvs.placement.plan import REQUIRED_STAGES
 from egvs.placement.problem_builder import PlacementProblem
 from egvs.runs import run
+from egvs.runs.run_context import open_folder
 from egvs.scoring.target_scores import DETECTORS, detection_chances
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import open_folder
 from egvs.stages.site_scans import empty_scans
 from egvs.stages.site_scoring import TargetScorer
 from tests.conftest import write_mini

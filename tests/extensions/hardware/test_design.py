@@ -29,10 +29,10 @@ from egvs.extensions.hardware.design import (
     start_elevations,
 )
 from egvs.extensions.hardware.design_request import ELEVATION_BOUNDS_DEG, DesignRequest
+from egvs.runs.run_context import open_folder
 from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, detection_chances
 from egvs.scoring.targets import weighted_mean
 from egvs.sensors.sensor import CATALOGUE, Sensor, resolve_sensor
-from egvs.stages.inputs import open_folder
 from egvs.stages.site_scoring import SiteScoring
 from tests.conftest import write_mini
 

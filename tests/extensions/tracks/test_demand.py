@@ -11,7 +11,7 @@ import pytest
 from egvs.extensions.tracks import demand as track_demand
 from egvs.extensions.tracks.demand import Follower
 from egvs.extensions.tracks.matching import MatchedTracks, match_tracks
-from egvs.traffic import estimates
+from egvs.statistics import intervals
 from tests.extensions.tracks.drives import LEFT, PERIOD_S, Drive, boxes_of, constant
 from tests.traffic.crossing import read_network
 
@@ -25,22 +25,22 @@ def match(folder: Path, *drives: Drive) -> MatchedTracks:
 )
 def test_poisson_interval_is_that_of_the_tables(count: int, low: float, high: float) -> None:
     """Garwood's limits as printed in textbooks."""
-    assert estimates.poisson_interval(count) == pytest.approx((low, high), abs=1e-4)
+    assert intervals.poisson_interval(count) == pytest.approx((low, high), abs=1e-4)
 
 
 def test_share_interval_of_extreme_shares() -> None:
     """With 0 of 10, the upper limit solves (1 - p)^10 = 0.025."""
-    assert estimates.share_interval(0, 10) == pytest.approx((0.0, 1.0 - 0.025**0.1))
-    assert estimates.share_interval(10, 10) == pytest.approx((0.025**0.1, 1.0))
+    assert intervals.share_interval(0, 10) == pytest.approx((0.0, 1.0 - 0.025**0.1))
+    assert intervals.share_interval(10, 10) == pytest.approx((0.025**0.1, 1.0))
 
 
 def test_interval_of_a_median_is_that_of_order_statistics() -> None:
     """Of ten values, the second and the ninth enclose the median with a probability of 97.9 %."""
-    estimate = estimates.median_of(list(range(1, 11)))
+    estimate = intervals.median_of(list(range(1, 11)))
     assert estimate is not None
     assert (estimate.value, estimate.low, estimate.high, estimate.n) == (5.5, 2.0, 9.0, 10)
     assert not estimate.is_usable
-    assert estimates.median_of([]) is None
+    assert intervals.median_of([]) is None
 
 
 def test_intervals_cover_the_truth_in_95_percent_of_trials() -> None:
@@ -48,7 +48,7 @@ def test_intervals_cover_the_truth_in_95_percent_of_trials() -> None:
     covered = np.zeros(3)
     for _ in range(400):
         values = rng.normal(1.1, 0.08, 40)
-        results = [estimates.mean_of(values), estimates.deviation_of(values), estimates.median_of(values)]
+        results = [intervals.mean_of(values), intervals.deviation_of(values), intervals.median_of(values)]
         for number, (estimate, truth) in enumerate(zip(results, (1.1, 0.08, 1.1), strict=True)):
             assert estimate is not None
             covered[number] += estimate.low <= truth <= estimate.high

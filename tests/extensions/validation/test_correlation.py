@@ -8,7 +8,6 @@ import scipy.stats
 from scipy.special import ndtr, ndtri
 
 from egvs.extensions.validation.correlation import (
-    COEFFICIENT_KINDS,
     ConfidenceInterval,
     CorrelationStudy,
     JunctionScores,
@@ -17,6 +16,7 @@ from egvs.extensions.validation.correlation import (
     share_above_zero,
 )
 from egvs.extensions.validation.detection_metrics import EvaluationFrames, evaluate, frame_blocks
+from egvs.statistics.ranks import COEFFICIENT_KINDS
 from tests.extensions.validation import simulated_studies
 from tests.extensions.validation.test_detection_metrics import random_scenes
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from egvs.extensions.validation.correlation import COEFFICIENT_KINDS, StandardisedValues, average_ranks
+from egvs.statistics.ranks import COEFFICIENT_KINDS, StandardisedValues
 
 OTHER = {
     "pearson": lambda a, b: scipy.stats.pearsonr(a, b).statistic,
@@ -66,10 +66,3 @@ def test_coefficient_is_symmetric_and_independent_of_site_order(kind):
     value = coefficient(a, b, kind)[0]
     assert coefficient(b, a, kind)[0] == pytest.approx(value, abs=1e-15)
     assert coefficient(a[row], b[row], kind)[0] == pytest.approx(value, abs=1e-14)
-
-
-def test_average_ranks_equal_scipy():
-    rng = np.random.default_rng(3)
-    values = np.vstack([rng.normal(size=(20, 9)), rng.integers(0, 4, size=(20, 9)), np.full((1, 9), 7.0)])
-    assert np.array_equal(average_ranks(values), scipy.stats.rankdata(values, axis=1))
-    assert average_ranks(np.array([[5.0, -1.0, 5.0, 0.0]])).tolist() == [[3.5, 1.0, 3.5, 2.0]]

@@ -32,9 +32,9 @@ from egvs.placement.branch_and_bound import BOUND_ROUNDING
 from egvs.placement.problem import PlanRules, Problem
 from egvs.placement.problem_builder import PlacementProblem
 from egvs.results.plans import PlannedSensor
+from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import PlacementConfig
-from egvs.stages.inputs import open_folder
 
 _UNLIMITED_BUDGET = 1e15
 

@@ -28,9 +28,9 @@ from egvs.extensions.city import results
 from egvs.extensions.city.results import CityPlan, junction_run_folder, mean_vehicles, score_factor
 from egvs.placement import problem_builder
 from egvs.results.plans import PlannedSensor
+from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import scenario_from_dict
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import open_folder
 
 _TOLERANCE = 1e-9
 """Relative difference of scores that are equal but for rounding."""

@@ -39,6 +39,7 @@ from egvs.core.resource_usage import ResourceUsage, measure_usage, release_memor
 from egvs.extensions.city.worker_check import library_names, program_versions
 from egvs.runs import run, stage_keys, stage_registry, store
 from egvs.runs.run import StageOptions
+from egvs.runs.run_context import open_folder
 from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
 from egvs.scenario.loading import load
@@ -51,7 +52,6 @@ from egvs.sensors.sites import Pose, ScannedSite
 from egvs.stages import check, site_scans
 from egvs.stages.base import StageContext
 from egvs.stages.check import SceneReport
-from egvs.stages.inputs import open_folder
 from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring
 
 P = ParamSpec("P")
@@ -397,10 +397,8 @@ def score_stored_scans(scoring: SiteScoring, only: Collection[str] | None = None
 
 def _keeping_scans(context: StageContext) -> StageContext:
     """Return a context of the same scene in which scans are kept."""
-    keeping = StageContext(context.inputs, context.folder, jobs=context.threads)
-    scan_config = context.scenario.scan.model_copy(update={"keep": True})
-    keeping.scenario = context.scenario.model_copy(update={"scan": scan_config})
-    return keeping
+    scan = context.scenario.scan.model_copy(update={"keep": True})
+    return context.with_scenario(context.scenario.model_copy(update={"scan": scan}))
 
 
 def _fetch_or_score(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder: Path) -> ResourceUsage:

@@ -49,13 +49,13 @@ from egvs.extensions.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLD
 from egvs.extensions.city.region_checks import RegionChecks, empty_regions
 from egvs.runs import stage_keys
 from egvs.runs.run import lock_run_folder
+from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import load, scenario_from_dict
 from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scoring.target_scores import ISOLATED_GAP_M
 from egvs.sensors import sites
 from egvs.stages import traffic
 from egvs.stages.base import Summary
-from egvs.stages.inputs import open_folder
 from egvs.traffic import recording, sumo_folder, trajectories, vehicle_boxes
 from egvs.traffic.fcd import FrameGroup
 from egvs.traffic.finished_fcd import FcdMetadata

@@ -331,7 +331,10 @@ async def _add_resource(name: str, dask_worker: Worker) -> None:
 
 
 def _assign_waiting_tasks(dask_scheduler: Scheduler) -> None:
-    """Assign tasks that no worker could run; Dask does this for a new worker, not for one with a new resource."""
+    """Assign tasks that no worker could run; Dask does this for a new worker, not for one with a new resource.
+
+    These methods of the scheduler are internal ones: Dask has no public call for this.
+    """
     for worker in list(dask_scheduler.running):
         tasks = dask_scheduler.bulk_schedule_unrunnable_after_adding_worker(worker)
         dask_scheduler.transitions(tasks, stimulus_id=f"egvs-{time.time()}")

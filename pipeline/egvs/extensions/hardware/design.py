@@ -46,15 +46,10 @@ from egvs.results.command_entries import DIGEST_KEY, design_digest
 from egvs.results.sensors import ScoreDifference
 from egvs.runs import run, stage_registry
 from egvs.runs.command_results import add_to_report
+from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
 from egvs.scenario.sensor_config import SensorConfig
-from egvs.scoring.standard_errors import (
-    BlockGroups,
-    ScoreUncertainty,
-    detector_groups,
-    group_sizes,
-    means_without_each,
-)
+from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty, detector_groups
 from egvs.scoring.target_scores import expected_by_detector
 from egvs.scoring.targets import (
     FrameGroups,
@@ -74,7 +69,7 @@ from egvs.sensors.sensor import CATALOGUE, Sensor, check_sensor_names
 from egvs.sensors.site_feasibility import ground_height_m
 from egvs.sensors.sites import Pose, Site
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import open_folder
+from egvs.statistics.blocks import group_sizes, means_without_each
 
 STAGES = ("check", "statics", "traffic", "tpog")
 MAX_PIECES = 7

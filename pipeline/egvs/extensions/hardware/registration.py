@@ -37,6 +37,7 @@ from egvs.core.grid import FloatArray, IntArray, Roi
 from egvs.core.special import cosdg, sindg
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose
+from egvs.statistics.blocks import clustered_mean_se, one_step_jackknife
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster
 from egvs.world.supports import Supports, without_solids
@@ -380,21 +381,6 @@ def parameter_name_and_unit(parameter: str) -> tuple[str, str]:
     return name, "degrees" if unit == "deg" else unit
 
 
-def clustered_mean_se(values: FloatArray, block: IntArray) -> tuple[float, float]:
-    """Return the mean of values and its standard error, which takes values of a block as dependent.
-
-    Parameters
-    ----------
-    values
-        The values, (n,).
-    block
-        Number of the block of each value, from 0, (n,).
-    """
-    mean = float(values.mean())
-    sums = np.bincount(block, weights=values - mean)
-    return mean, float(np.sqrt((sums**2).sum())) / len(values)
-
-
 def _azimuth_blocks(points_m: FloatArray) -> IntArray:
     """Return the number of the sector of azimuth of each point, from 0, without gaps."""
     azimuth_deg = np.degrees(np.arctan2(points_m[:, 1], points_m[:, 0]))
@@ -409,12 +395,9 @@ def _jackknife(along: FloatArray, curvature: FloatArray, scores: FloatArray, clu
     products = (along * curvature[:, None])[order, :, None] * along[order, None, :]
     normals = np.add.reduceat(products, starts, axis=0)
     sums = np.add.reduceat(scores[order], starts, axis=0)
-    without = np.linalg.pinv(normals.sum(axis=0) - normals, rcond=1e-9, hermitian=True)
-    shifts = np.einsum("gij,gj->gi", without, sums)
-    covariance: FloatArray = shifts.T @ shifts * ((len(shifts) - 1) / len(shifts))
     information = np.bincount(cluster, weights=curvature).astype(np.float64)
-    summed: FloatArray = covariance + _single_cluster_variance(normals, information)
-    return summed
+    covariance: FloatArray = one_step_jackknife(normals, sums) + _single_cluster_variance(normals, information)
+    return covariance
 
 
 def _single_cluster_variance(normals: FloatArray, information: FloatArray) -> FloatArray:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from egvs.cli.options import Detector, Jobs, Set, SettingsPath
-from egvs.cli.quick_help import QuickHelpGroup
 from egvs.core.errors import InputError
 from egvs.core.wording import format_percent
 from egvs.extensions.hardware.design_request import ALL_SENSORS, ELEVATION_BOUNDS_DEG, DesignRequest
@@ -27,7 +26,7 @@ _REQUEST = DesignRequest("")
 _RECORDING = RecordingOptions()
 _LOW_DEG, _HIGH_DEG = ELEVATION_BOUNDS_DEG
 
-app = typer.Typer(cls=QuickHelpGroup, no_args_is_help=True, help="Derive a sensor from its sweeps, or design one.")
+app = typer.Typer(no_args_is_help=True, help="Derive a sensor from its sweeps, or design one.")
 
 
 @app.callback()

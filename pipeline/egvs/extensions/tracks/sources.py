@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from egvs.core import files, plugins
+from egvs.core import plugins
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.extensions.tracks import user_table
 from egvs.extensions.tracks.model import HEAD_BYTES, TrackReader, Tracks
@@ -120,12 +121,12 @@ def _read_head(path: Path) -> bytes:
     """Return the first bytes of a file, after gunzip where possible."""
     if not path.is_file():
         raise InputError(path, "no such file", "Check the path.")
-    with files.open_input(path) as content:
+    with open_input(path) as content:
         head: bytes = content.read(HEAD_BYTES)
     if not head.startswith(_GZIP):
         return head
     try:
-        with files.open_input(path) as content, gzip.open(content) as unzipped:
+        with open_input(path) as content, gzip.open(content) as unzipped:
             return unzipped.read(HEAD_BYTES)
     except (EOFError, OSError, zlib.error):  # damaged: its reader says so
         return head

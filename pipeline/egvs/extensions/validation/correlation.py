@@ -1,16 +1,6 @@
 r"""Correlation of scores with measures of detection over sites: Pearson, Spearman, Kendall, with intervals.
 
-**Coefficients.** Each is the cosine of two vectors, one per list of values,
-
-.. math:: c = \frac{\sum_k a_k b_k}{\sqrt{\sum_k a_k^2} \sqrt{\sum_k b_k^2}}
-
-- Pearson: a are the values minus their mean.
-- Spearman: a are the ranks minus their mean; equal values share the mean of their ranks.
-- Kendall: a are the signs of the differences of all pairs; a pair of equal values has 0 (tau-b: Kendall, Biometrika 33,
-  1945).
-
-So each list is standardised once, whatever it is compared with. The coefficient is undefined (NaN) for fewer than three
-values, and where all values of a list are equal.
+**Coefficients**: see :class:`egvs.statistics.ranks.StandardisedValues`.
 
 **Resampling.** A correlation is uncertain in two ways: other sites could have been chosen, and other frames recorded. A
 resample draws n of the n sites with replacement (all sites of a pole together), and k of the k blocks of frames; the
@@ -50,11 +40,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
 from zlib import crc32
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from egvs.clouds.sweeps import BoolArray
@@ -62,16 +50,7 @@ from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.wording import format_percent
 from egvs.extensions.validation.detection_metrics import JackknifeEstimate
-
-CoefficientKind = Literal["pearson", "spearman", "kendall"]
-
-COEFFICIENT_KINDS: tuple[CoefficientKind, ...] = ("pearson", "spearman", "kendall")
-
-MIN_VALUES = 3
-"""Values that a coefficient needs: the correlation of two is always perfect."""
-
-EQUALITY_TOLERANCE = 1e-12
-"""Values are equal if they differ by less than this share of the largest."""
+from egvs.statistics.ranks import MIN_VALUES, CoefficientKind, StandardisedValues
 
 CONFIDENCE_LEVEL = 0.95
 
@@ -85,65 +64,6 @@ MIN_POLES = 5
 """Poles of a junction that an interval needs."""
 
 _TIE_TOLERANCE = 1e-12
-
-
-@dataclass(frozen=True)
-class StandardisedValues:
-    """Lists of values, prepared for one kind of coefficient; one list per resample.
-
-    Attributes
-    ----------
-    vector
-        (resamples, d): float64, or int8 for the signs of Kendall.
-    norm
-        Length of each vector, (resamples,) float64; NaN where all values are equal.
-    """
-
-    vector: NDArray[Any]
-    norm: FloatArray
-
-    @classmethod
-    def from_values(cls, values: FloatArray, kind: CoefficientKind) -> StandardisedValues:
-        """Standardise values, shape (resamples, n), float64."""
-        if kind == "kendall":
-            first, second = np.triu_indices(values.shape[1], 1)
-            a = values[:, first]
-            b = values[:, second]
-            vector: NDArray[Any] = (a > b).astype(np.int8) - (a < b).astype(np.int8)
-            norm = np.sqrt(np.count_nonzero(vector, axis=1))
-        else:
-            vector = average_ranks(values) if kind == "spearman" else values
-            vector = vector - vector.mean(axis=1, keepdims=True)
-            norm = np.sqrt((vector**2).sum(axis=1))
-        differ = np.ptp(values, axis=1) > EQUALITY_TOLERANCE * np.abs(values).max(axis=1, initial=0.0)
-        return cls(vector, np.where(differ & (values.shape[1] >= MIN_VALUES), norm, np.nan))
-
-    def correlate(self, other: StandardisedValues) -> FloatArray:
-        """Return the coefficient with other values of the same kind, (resamples,) float64, from -1 to 1."""
-        if self.vector.dtype == np.int8:
-            product = (self.vector * other.vector).sum(axis=1, dtype=np.int32).astype(np.float64)
-        else:
-            product = np.einsum("ij,ij->i", self.vector, other.vector)
-        coefficient: FloatArray = np.clip(product / self.norm / other.norm, -1.0, 1.0)
-        return coefficient
-
-
-def average_ranks(values: FloatArray) -> FloatArray:
-    """Return the rank of each value in its row, from 1, (rows, n) float64; equal values share their mean rank.
-
-    As ``scipy.stats.rankdata``: loading scipy.stats takes longer than most correlations.
-    """
-    order = np.argsort(values, axis=1)
-    ascending = np.take_along_axis(values, order, axis=1)
-    differs = np.diff(ascending, axis=1) > 0.0
-    edge = np.ones((len(values), 1), dtype=np.bool_)
-    position = np.arange(values.shape[1])
-    first = np.maximum.accumulate(np.where(np.hstack([edge, differs]), position, 0), axis=1)
-    last_or_end = np.where(np.hstack([differs, edge]), position, values.shape[1])
-    last = np.minimum.accumulate(last_or_end[:, ::-1], axis=1)[:, ::-1]
-    ranks = np.empty(values.shape)
-    np.put_along_axis(ranks, order, (first + last) / 2.0 + 1.0, axis=1)
-    return ranks
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from egvs.runs import stage_keys, stage_registry
 from egvs.runs.store import Store
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
-from egvs.stages.scene_inputs import sensor_digests
+from egvs.stages.scene_dependencies import sensor_digests
 
 
 class Viewpoint(Protocol):

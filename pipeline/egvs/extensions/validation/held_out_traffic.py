@@ -26,9 +26,9 @@ from egvs.core.errors import InputError
 from egvs.core.grid import IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs.run import ensure_stages
+from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
 from egvs.sensors.scene import Scene
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.traffic import finished_fcd
 
 DEFAULT_SPACING_S, MIN_SPACING_S = 7.0, 2.0
@@ -170,7 +170,7 @@ def prepare_held_out_traffic(
         recorded = int(metadata["frames"])
         period_ends = tuple(itertools.accumulate(p["frames"] for p in metadata.get("periods", ()))) or (recorded,)
     numbers = select_frame_numbers(held_out, recorded, frames, apart_s)
-    return HeldOutTraffic(held_out, get_scene(context), trajectories, numbers, keys, apart_s, period_ends)
+    return HeldOutTraffic(held_out, context.scene, trajectories, numbers, keys, apart_s, period_ends)
 
 
 def default_spacing_s(scenario: Scenario, frames: int) -> float:

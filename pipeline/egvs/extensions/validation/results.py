@@ -22,13 +22,14 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core import files
 from egvs.core.errors import Diagnostic
-from egvs.extensions.validation.correlation import CoefficientKind, Correlation
+from egvs.extensions.validation.correlation import Correlation
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS, SiteDetection
 from egvs.extensions.validation.held_out_traffic import TrafficSample
 from egvs.extensions.validation.ranking_check import DetectorCheck, RankingCheck
 from egvs.extensions.validation.surrogates import Surrogates
 from egvs.results.labels import SCORE_LABELS
 from egvs.scenario.model import Scenario
+from egvs.statistics.ranks import CoefficientKind
 from egvs.studies.decision_figure import LabelPlacement
 
 if TYPE_CHECKING:

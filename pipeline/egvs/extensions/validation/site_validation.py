@@ -26,7 +26,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.extensions.validation import detection_metrics, kitti_results, ranking_evidence, results, surrogates
-from egvs.extensions.validation.correlation import COEFFICIENT_KINDS, CorrelationStudy, JunctionScores, MeasureValues
+from egvs.extensions.validation.correlation import CorrelationStudy, JunctionScores, MeasureValues
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS, SiteDetection
 from egvs.extensions.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
 from egvs.extensions.validation.detectors import base
@@ -38,9 +38,10 @@ from egvs.extensions.validation.surrogates import Surrogates
 from egvs.extensions.validation.validation_run import ValidationRun, validation_metadata, validation_run
 from egvs.runs import run as runs
 from egvs.runs import stage_keys, stage_registry
+from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
-from egvs.stages.inputs import open_folder
+from egvs.statistics.ranks import COEFFICIENT_KINDS
 
 CORRELATION_TABLE = RunFolder.correlation.name
 

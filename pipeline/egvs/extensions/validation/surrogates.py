@@ -42,6 +42,7 @@ from egvs.extensions.validation.target_points import TargetPoints, list_target_p
 from egvs.kernels.hits import max_free_probability
 from egvs.runs import stage_keys
 from egvs.runs.run import ensure_stages
+from egvs.runs.run_context import open_folder
 from egvs.scenario.effects_config import MovingOcclusionParameters
 from egvs.scenario.model import Scenario
 from egvs.scoring import targets
@@ -51,7 +52,6 @@ from egvs.scoring.visibility import Beams, HitCounter, Hits
 from egvs.sensors import voxel_crossings
 from egvs.sensors.scene import Scene
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.site_scans import SiteScan, empty_scans
 from egvs.studies.measurement import scenario_dependencies
 
@@ -554,7 +554,7 @@ class _PreparedScenario:
         self._record: TargetRecord | None = None
         context = self._context(self._scenario)
         ensure_stages(context, "statics", "scan", "traffic")
-        self.scene = get_scene(context)
+        self.scene = context.scene
 
     def _context(self, scenario: Scenario) -> StageContext:
         return open_folder(scenario, self._folder, jobs=self._jobs, progress=self._progress)

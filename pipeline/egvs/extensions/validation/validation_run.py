@@ -25,8 +25,8 @@ from egvs.extensions.validation.held_out_traffic import FrameSampling, HeldOutTr
 from egvs.extensions.validation.results import main_measure
 from egvs.runs import stage_keys, stage_registry
 from egvs.runs.run import lock_run_folder
+from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
-from egvs.stages.inputs import open_folder
 from egvs.traffic import departures, sumo_folder, user_files
 
 _WORK_PREFIX = ".validate-"

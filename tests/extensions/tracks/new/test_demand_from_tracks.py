@@ -14,7 +14,8 @@ import egvs
 from egvs.core.errors import InputError
 from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
 from egvs.scenario.model import SCENARIO_FILE
-from egvs.traffic import estimates, sumo
+from egvs.statistics import intervals
+from egvs.traffic import sumo
 from tests.extensions.tracks.new.test_recorded_traffic import HEADER, K733
 from tests.traffic.crossing import NETWORK
 
@@ -229,7 +230,7 @@ def test_demand_of_a_simulation_is_recovered(tmp_path: Path) -> None:
     assert sum(others) <= 2
     car, truck = egvs.load(tmp_path / "new").traffic.kinds
     total = sum(each.vehicles for each in new.demand.movements)
-    low, high = estimates.share_interval(round(truck.share * total), total)
+    low, high = intervals.share_interval(round(truck.share * total), total)
     assert low <= TRUCK_SHARE <= high
     assert car.length_m == pytest.approx(4.5, abs=0.01)
     assert car.attributes["minGap"] == pytest.approx(MIN_GAP_M, abs=0.02)

@@ -20,6 +20,7 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.statistics.blocks import jackknife_variance
 
 MAX_PLANES = 3
 MAX_TILT_DEG = 45.0
@@ -215,6 +216,5 @@ def _jackknife(members: FloatArray) -> FloatArray:
     if len(sectors) < 3:
         return np.full(3, np.nan)
     poses = np.array([_pose(_solve(sum(products) - p, sum(sides) - s)) for p, s in zip(products, sides, strict=True)])
-    k = len(sectors)
-    errors: FloatArray = np.sqrt((k - 1) / k * ((poses - poses.mean(axis=0)) ** 2).sum(axis=0))
+    errors: FloatArray = np.sqrt(jackknife_variance(poses))
     return errors

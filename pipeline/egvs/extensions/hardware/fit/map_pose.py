@@ -19,12 +19,12 @@ from egvs.extensions.hardware.registration import (
     Registration,
     StaticSurfaces,
     YawSearch,
-    clustered_mean_se,
     parameter_name_and_unit,
     sample_points,
     search_yaw,
 )
 from egvs.sensors.sites import Pose
+from egvs.statistics.blocks import clustered_mean_se
 from egvs.world.mesh import World
 
 MAX_HORIZONTAL_SHIFT_M = 5.0

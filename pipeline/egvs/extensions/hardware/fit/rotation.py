@@ -24,7 +24,7 @@ import numpy as np
 from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.fit.beam_angles import BeamAngles, nearest_channels
 from egvs.extensions.hardware.fit.sweep_files import Sweep
-from egvs.statistics.intervals import jackknife_variance
+from egvs.statistics.blocks import jackknife_variance
 
 MIN_RATE_HZ, MAX_RATE_HZ = 1.0, 60.0
 """Slowest and fastest rotation that is looked for."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -172,14 +172,6 @@ def parse_number(where: str, text: str | None, limit: float = math.inf, unit: st
     return value
 
 
-@dataclass
-class _Relations:
-    """Relations by identifier, until all objects are read."""
-
-    lanelets: dict[int, tuple[tuple[Member, ...], Tags]] = field(default_factory=dict)
-    regulations: dict[int, tuple[tuple[Member, ...], Tags]] = field(default_factory=dict)
-
-
 class _Reader:
     """Collects the objects of one file."""
 
@@ -187,7 +179,8 @@ class _Reader:
         self._path = path
         self._points: dict[int, MapPoint] = {}
         self._lines: dict[int, Way] = {}
-        self._relations = _Relations()
+        self._lanelets: dict[int, tuple[tuple[Member, ...], Tags]] = {}
+        self._regulations: dict[int, tuple[tuple[Member, ...], Tags]] = {}
         self._is_autoware = False
 
     def add(self, element: Element) -> None:
@@ -215,7 +208,7 @@ class _Reader:
         """Check all references and return the map."""
         lanelets: dict[int, Lanelet] = {}
         incomplete = []
-        for identifier, (members, tags) in sorted(self._relations.lanelets.items()):
+        for identifier, (members, tags) in sorted(self._lanelets.items()):
             lanelet = self._make_lanelet(identifier, members, tags)
             if lanelet is None:
                 incomplete.append(identifier)
@@ -226,7 +219,7 @@ class _Reader:
         self._check_nodes()
         regulations = {}
         missing = 0
-        for identifier, (members, tags) in sorted(self._relations.regulations.items()):
+        for identifier, (members, tags) in sorted(self._regulations.items()):
             present = tuple(member for member in members if self._has(member))
             missing += len(members) - len(present)
             regulations[identifier] = Regulation(identifier, present, tags)
@@ -238,7 +231,7 @@ class _Reader:
         kind = tags.get("type")
         if kind not in ("lanelet", "regulatory_element"):
             return
-        relations = self._relations.lanelets if kind == "lanelet" else self._relations.regulations
+        relations = self._lanelets if kind == "lanelet" else self._regulations
         self._check_new(where, identifier, relations)
         members = []
         for member in element:
@@ -291,7 +284,7 @@ class _Reader:
                 return None
             bounds.append(ways[0])
         regulations = (m.id for m in members if m.type == "relation" and m.role == "regulatory_element")
-        present = tuple(number for number in regulations if number in self._relations.regulations)
+        present = tuple(number for number in regulations if number in self._regulations)
         return Lanelet(identifier, bounds[0], bounds[1], present, tags)
 
     def _check_nodes(self) -> None:
@@ -307,4 +300,4 @@ class _Reader:
                 return member.id in self._points
             case "way":
                 return member.id in self._lines
-        return member.id in self._relations.lanelets or member.id in self._relations.regulations
+        return member.id in self._lanelets or member.id in self._regulations

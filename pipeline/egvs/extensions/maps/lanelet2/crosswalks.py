@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -20,9 +19,7 @@ from shapely.geometry import LineString, Point
 
 from egvs.core.grid import FloatArray
 from egvs.extensions.maps.formats.lanelet2_graph import DirectedLanelet, LaneletGraph, LaneletKey, split_lanelets
-
-if TYPE_CHECKING:
-    from egvs.extensions.maps.lanelet2.roads import Road, RoadLayout
+from egvs.extensions.maps.lanelet2.road_layout import Road, RoadLayout
 
 MARGIN_M = 0.5
 """Vehicles stop so far before a crosswalk."""

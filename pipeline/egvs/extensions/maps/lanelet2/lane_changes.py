@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from egvs.extensions.maps.formats.lanelet2 import LaneletMap
 from egvs.extensions.maps.lane_changes import open_unreachable_lanes
-from egvs.extensions.maps.lanelet2.roads import Road, RoadLayout
+from egvs.extensions.maps.lanelet2.road_layout import Road, RoadLayout
 from egvs.extensions.maps.lanelet2.rules import may_cross
 
 

@@ -28,7 +28,7 @@ from egvs.extensions.maps.lanelet2.crosswalks import Crosswalk
 from egvs.extensions.maps.lanelet2.lane_changes import find_lane_changes
 from egvs.extensions.maps.lanelet2.nodes import ATTEMPTS, NodeShapes, lane_errors_m
 from egvs.extensions.maps.lanelet2.right_of_way import find_right_of_way
-from egvs.extensions.maps.lanelet2.roads import Road, RoadLayout, Turn
+from egvs.extensions.maps.lanelet2.road_layout import Road, RoadLayout, Turn
 from egvs.extensions.maps.lanelet2.sidewalks import crossing_elements, crossing_lines_m, sidewalk_element
 from egvs.extensions.maps.lanelet2.signals import SignalPlan
 from egvs.formats.georeference import WorldFrame

@@ -19,7 +19,7 @@ import shapely
 from shapely.geometry import LineString, MultiLineString, MultiPoint, Point, Polygon
 
 from egvs.core.grid import FloatArray
-from egvs.extensions.maps.lanelet2.roads import Road, RoadLayout
+from egvs.extensions.maps.lanelet2.road_layout import Road, RoadLayout
 
 STRIPS_M = (0.1, 0.05)
 """Half width of the strip about a lane's line that stays free, in the first and in the second attempt."""

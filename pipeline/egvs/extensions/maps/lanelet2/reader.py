@@ -32,7 +32,8 @@ from egvs.extensions.maps.lanelet2 import rules
 from egvs.extensions.maps.lanelet2.crosswalks import Crosswalk, place_crosswalks
 from egvs.extensions.maps.lanelet2.network import MAX_LANE_ERROR_M, NetworkBuilder, NetworkQuality, unused_relations
 from egvs.extensions.maps.lanelet2.right_of_way import RightOfWay
-from egvs.extensions.maps.lanelet2.roads import RoadLayout, make_roads
+from egvs.extensions.maps.lanelet2.road_layout import RoadLayout
+from egvs.extensions.maps.lanelet2.roads import make_roads
 from egvs.extensions.maps.lanelet2.signals import SignalPlan, plan_signals
 
 NAME = "Lanelet2"

@@ -15,7 +15,7 @@ from shapely.geometry import LineString
 
 from egvs.creation.plain_network import PlainElement
 from egvs.extensions.maps.formats.lanelet2 import LaneletMap
-from egvs.extensions.maps.lanelet2.roads import RoadLayout, Turn
+from egvs.extensions.maps.lanelet2.road_layout import RoadLayout, Turn
 
 RoadPair = tuple[str, str]
 """The roads that a connection leads from and to."""

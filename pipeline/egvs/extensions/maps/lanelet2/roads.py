@@ -23,18 +23,16 @@ import heapq
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 import shapely
 from shapely.geometry import Point
 
-from egvs.core import polylines
 from egvs.core.grid import FloatArray
 from egvs.extensions.maps.formats.lanelet2_graph import DirectedLanelet, LaneletGraph, LaneletKey, split_lanelets
-from egvs.extensions.maps.lanelet2.arms import Groups, join_arms
 from egvs.extensions.maps.lanelet2.crosswalks import cut_at_crosswalks
+from egvs.extensions.maps.lanelet2.road_layout import Road, RoadLayout, Turn
 
 LEVEL_M = 3.0
 """Roads at least so far above each other do not meet."""
@@ -54,10 +52,34 @@ CROSSWALK_RANGE_M = 15.0
 MAX_STUB_M, MAX_STUB_SHARE = 15.0, 0.3
 """Length of the road that is cut off a lanelet where the map begins or ends in a junction, and its largest share."""
 
-APPROACH_M = 30.0
-"""Lights and signs govern the next junction if it is nearer than this to the lanelets that refer to them."""
+ARM_GAP_M = 15.0
+"""Roads whose lanes end nearer to each other than this, in the same direction, are the same street."""
 
+_SAME_DIRECTION_COS = 0.8
 _TURN_DIRECTIONS = frozenset({"left", "right", "straight"})
+
+RoadEnd = tuple[str, str]
+"""Identifier of a road, and "start" or "end"."""
+
+
+class Groups:
+    """Union-find: groups of things that are joined."""
+
+    def __init__(self) -> None:
+        self._parents: dict[object, object] = {}
+
+    def find(self, thing: object) -> object:
+        """Return the representative of a thing's group."""
+        root = thing
+        while (parent := self._parents.setdefault(root, root)) != root:
+            root = parent
+        while self._parents[thing] != root:
+            self._parents[thing], thing = root, self._parents[thing]
+        return root
+
+    def join(self, a: object, b: object) -> None:
+        """Make one group of two."""
+        self._parents[self.find(a)] = self.find(b)
 
 
 @dataclass(frozen=True)
@@ -72,114 +94,6 @@ class Overlap:
     def is_within(self, keys: set[LaneletKey]) -> bool:
         """Return whether both lanelets are among some."""
         return self.first in keys and self.second in keys
-
-
-@dataclass(frozen=True)
-class Road:
-    """An edge of the network.
-
-    Attributes
-    ----------
-    id
-        Identifier.
-    lanes
-        Lane 0, at the kerb, first.
-    start, end
-        The nodes where it starts and ends.
-    """
-
-    id: str
-    lanes: tuple[DirectedLanelet, ...]
-    start: str = ""
-    end: str = ""
-
-    @property
-    def length_m(self) -> float:
-        """Mean length of its lanes, seen from above."""
-        return float(np.mean([polylines.length_m(lane.center_m) for lane in self.lanes]))
-
-
-@dataclass(frozen=True, eq=False)
-class Turn:
-    """A connection between two lanes.
-
-    Attributes
-    ----------
-    source, source_lane, target, target_lane
-        Identifiers of the roads, and indices of their lanes.
-    path
-        The inner lanelets between them.
-    shape_m
-        (n, 3) float64: the centre line of the path; empty where the lanes touch.
-    """
-
-    source: str
-    source_lane: int
-    target: str
-    target_lane: int
-    path: tuple[LaneletKey, ...]
-    shape_m: FloatArray
-
-
-@dataclass(frozen=True)
-class RoadLayout:
-    """Roads, nodes and turns of a map.
-
-    Attributes
-    ----------
-    graph
-        The lanelets, some of them cut.
-    roads
-        By identifier.
-    inner
-        The node of each inner lanelet.
-    turns
-        All permitted turns.
-    unused
-        Inner lanelets that no turn uses: their chain begins or ends in the junction.
-    stubs
-        The lanelets that begin or end inside a junction, a piece of which became a road.
-    sidewalks
-        The roads that get a sidewalk.
-    """
-
-    graph: LaneletGraph
-    roads: dict[str, Road]
-    inner: dict[LaneletKey, str]
-    turns: tuple[Turn, ...]
-    unused: tuple[LaneletKey, ...]
-    stubs: tuple[LaneletKey, ...]
-    sidewalks: frozenset[str] = frozenset()
-
-    def sumo_lane(self, road: str, index: int) -> int:
-        """Return SUMO's index of a lane: a sidewalk comes first."""
-        return index + 1 if road in self.sidewalks else index
-
-    @cached_property
-    def turns_from(self) -> dict[tuple[str, int], list[Turn]]:
-        """The turns from each lane, by road and lane."""
-        turns: dict[tuple[str, int], list[Turn]] = defaultdict(list)
-        for turn in self.turns:
-            turns[turn.source, turn.source_lane].append(turn)
-        return dict(turns)
-
-    def turns_in_junction(self, turn: Turn) -> list[Turn]:
-        """Return a turn, or those of the next junction within :data:`APPROACH_M` if it only leads to another road."""
-        walked_m = 0.0
-        while not turn.path:
-            lane = self.roads[turn.target].lanes[turn.target_lane]
-            walked_m += polylines.length_m(lane.center_m)
-            following = self.turns_from.get((turn.target, turn.target_lane), [])
-            if walked_m > APPROACH_M or not following:
-                return []
-            if len(following) > 1:
-                return [other for other in following if other.path]
-            turn = following[0]
-        return [turn]
-
-    def nodes(self) -> list[str]:
-        """Return all nodes, sorted."""
-        return sorted({node for road in self.roads.values() for node in (road.start, road.end)})
 
 
 def make_roads(graph: LaneletGraph, *, lefthand: bool, crosswalks: Sequence[DirectedLanelet] = ()) -> RoadLayout:
@@ -342,7 +256,7 @@ def _make_road(graph: LaneletGraph, chain: list[LaneletKey]) -> Road:
 
 def _short_roads_beside(
     roads: Sequence[Road],
-    node_of_end: Mapping[tuple[str, str], str],
+    node_of_end: Mapping[RoadEnd, str],
     node_of_inner: Mapping[LaneletKey, str],
     crossed: Mapping[LaneletKey, int],
 ) -> set[LaneletKey]:
@@ -363,8 +277,8 @@ def _find_nodes(
     inner: set[LaneletKey],
     overlaps: list[Overlap],
     crossed: Mapping[LaneletKey, int],
-) -> tuple[dict[tuple[str, str], str], dict[LaneletKey, str]]:
-    """Return the node of each road end, ``(road, "start" or "end")``, and of each inner lanelet."""
+) -> tuple[dict[RoadEnd, str], dict[LaneletKey, str]]:
+    """Return the node of each road end, and of each inner lanelet."""
     road_of = {lane.key: road.id for road in roads for lane in road.lanes}
     groups = Groups()
     for key, after in graph.followers.items():
@@ -379,7 +293,7 @@ def _find_nodes(
             groups.join(one_end, other_end)
     for key, crosswalk in crossed.items():
         groups.join(key, crosswalk)
-    join_arms(graph, roads, groups)
+    _join_arms(graph, roads, groups)
 
     members: dict[object, list[LaneletKey]] = defaultdict(list)
     for key in sorted(inner):
@@ -399,9 +313,53 @@ def _find_nodes(
     return node_of_end, {key: names[groups.find(key)] for key in inner}
 
 
-def _ends_by_point(graph: LaneletGraph, roads: list[Road]) -> dict[int, list[tuple[str, str]]]:
+def _join_arms(graph: LaneletGraph, roads: Sequence[Road], groups: Groups) -> None:
+    """Join the ends of roads where the map ends, if they lie side by side and lead out in the same direction.
+
+    Without this, a street with a median would count as two arms of its junction, and vehicles could be sent back where
+    they come from. Both ends of a road are never joined.
+    """
+    members: dict[object, list[RoadEnd]] = defaultdict(list)
+    for road in roads:
+        for end in ("start", "end"):
+            members[groups.find((road.id, end))].append((road.id, end))
+    free = {(road.id, end) for road in roads for end in ("start", "end") if _is_free(graph, road, end)}
+    roads_by_id = {road.id: road for road in roads}
+    candidates = sorted(end for ends in members.values() if free.issuperset(ends) for end in ends)
+    lines = [_lane_ends(roads_by_id[road_id], end) for road_id, end in candidates]
+    if not lines:
+        return
+    areas = [shapely.MultiPoint(points_m[:, :2]) for points_m, _ in lines]
+    first, second = shapely.STRtree(areas).query(areas, predicate="dwithin", distance=ARM_GAP_M)
+    for i, j in sorted(zip(first.tolist(), second.tolist(), strict=True)):
+        (points_a, out_a), (points_b, out_b) = lines[i], lines[j]
+        is_level = abs(points_a[:, 2].mean() - points_b[:, 2].mean()) < LEVEL_M
+        if i >= j or not is_level or float(out_a @ out_b) < _SAME_DIRECTION_COS:
+            continue
+        one, other = groups.find(candidates[i]), groups.find(candidates[j])
+        both = members[one] + members[other]
+        if one != other and len({road_id for road_id, _ in both}) == len(both):
+            groups.join(one, other)
+            members[groups.find(one)] = both
+
+
+def _is_free(graph: LaneletGraph, road: Road, end: str) -> bool:
+    """Return whether nothing leads to a road's start, or on from its end."""
+    relations = graph.predecessors if end == "start" else graph.followers
+    return not any(relations[lane.key] for lane in road.lanes)
+
+
+def _lane_ends(road: Road, end: str) -> tuple[FloatArray, FloatArray]:
+    """Return the points (n, 3) where the lanes of a road end, and the direction (2,) out of the map there."""
+    last, inner = (0, 1) if end == "start" else (-1, -2)
+    points_m = np.array([lane.center_m[last] for lane in road.lanes])
+    out = np.sum([(lane.center_m[last] - lane.center_m[inner])[:2] for lane in road.lanes], axis=0)
+    return points_m, np.asarray(out / max(float(np.hypot(*out)), 1e-9))
+
+
+def _ends_by_point(graph: LaneletGraph, roads: list[Road]) -> dict[int, list[RoadEnd]]:
     """Return the road ends at each point that ends a bound; not where the map begins or ends inside a junction."""
-    by_point: dict[int, list[tuple[str, str]]] = defaultdict(list)
+    by_point: dict[int, list[RoadEnd]] = defaultdict(list)
     for road in roads:
         for lane in road.lanes:
             for index, (end, relations) in enumerate((("start", graph.predecessors), ("end", graph.followers))):

@@ -16,7 +16,7 @@ from egvs.core import files
 from egvs.core.grid import FloatArray
 from egvs.creation.plain_network import NETWORK_FILE, PlainElement, format_number, format_shape
 from egvs.extensions.maps.lanelet2.crosswalks import Crosswalk
-from egvs.extensions.maps.lanelet2.roads import Road
+from egvs.extensions.maps.lanelet2.road_layout import Road
 from egvs.extensions.maps.lanelet2.signals import SignalPlan
 from egvs.formats import xml
 

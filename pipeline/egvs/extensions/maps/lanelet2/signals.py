@@ -21,7 +21,7 @@ from shapely.geometry import LineString, Point
 from egvs.core.grid import FloatArray
 from egvs.creation.plain_network import PlainElement
 from egvs.extensions.maps.formats.lanelet2 import LaneletMap, Regulation
-from egvs.extensions.maps.lanelet2.roads import RoadLayout, Turn
+from egvs.extensions.maps.lanelet2.road_layout import RoadLayout, Turn
 
 STOP_LINE_RANGE_M = 10.0
 """A light without lanelets governs the lanes that end nearer than this to its stop line."""

@@ -25,8 +25,8 @@ from egvs.extensions.tracks.demand import Passage
 from egvs.extensions.tracks.new.fleet import VEHICLE_CLASSES, KindEstimate, estimate_fleet
 from egvs.extensions.tracks.new.motion import MatchedRecording
 from egvs.scenario.traffic_config import CountConfig
-from egvs.traffic import estimates
-from egvs.traffic.estimates import MIN_OBSERVATIONS
+from egvs.statistics import intervals
+from egvs.statistics.intervals import MIN_OBSERVATIONS
 from egvs.traffic.network import CAR, Network
 
 
@@ -154,7 +154,7 @@ def estimate_demand(recording: MatchedRecording, streets: Streets, junction: Str
 
 
 def _movement(flow: CountConfig, vehicles: int, duration_s: float) -> MovementEstimate:
-    low, high = estimates.poisson_interval(vehicles)
+    low, high = intervals.poisson_interval(vehicles)
     hours = duration_s / 3600.0
     count = flow.model_copy(update={"per_hour": round(vehicles / hours, 1)})
     return MovementEstimate(count, vehicles, low / hours, high / hours)

@@ -1,6 +1,7 @@
 """Estimate the fleet of a new scenario from recorded vehicles: kinds, sizes, desired speeds, gaps and headways.
 
-A value from fewer than :data:`egvs.traffic.estimates.MIN_OBSERVATIONS` vehicles of a kind is left at SUMO's default.
+A value from fewer than :data:`egvs.statistics.intervals.MIN_OBSERVATIONS` vehicles of a kind is left at SUMO's
+default.
 Gaps need recorded sizes.
 """
 
@@ -20,9 +21,8 @@ from egvs.extensions.tracks.demand import Follower
 from egvs.extensions.tracks.matching import MatchedTracks
 from egvs.extensions.tracks.recorded_tracks import MOTOR_CLASSES
 from egvs.scenario.traffic_config import TrafficConfig, VehicleKind
-from egvs.traffic import estimates
+from egvs.statistics import intervals
 from egvs.traffic.class_sizes import CLASS_SIZES
-from egvs.traffic.estimates import Estimate
 
 VEHICLE_CLASSES = (*sorted(MOTOR_CLASSES), "motorcycle")
 """Classes of road users that become the fleet."""
@@ -98,7 +98,7 @@ class _KindAttributes:
         if not self.defaults:
             return self.comments
         texts = ", ".join(f"{name} ({number})" for name, number in self.defaults.items())
-        few = f"fewer than {estimates.MIN_OBSERVATIONS} vehicles show another value"
+        few = f"fewer than {intervals.MIN_OBSERVATIONS} vehicles show another value"
         return [*self.comments, f"SUMO's default, since {few}: {texts}"]
 
 
@@ -133,7 +133,7 @@ def _kinds(
         sizes_m = tracks.size_m[[track for track in members if tracks.classes[track] == name]]
         size_origin, is_default = _size_origin(name, sizes_m, tracks)
         attributes = _attributes(name, tracks, behaviour, has_sizes=not is_default)
-        low, high = estimates.share_interval(number, fleet.total())
+        low, high = intervals.share_interval(number, fleet.total())
         share = f"{number:,} of {fleet.total():,} vehicles (share 95 %: {low:.2f} to {high:.2f})"
         length_m, width_m, height_m = np.round(np.median(sizes_m, axis=0), 2).tolist()
         kind = VehicleKind(
@@ -150,7 +150,7 @@ def _attributes(name: str, tracks: CleanTracks, behaviour: _Behaviour, *, has_si
     _add_speed_factor(attributes, factors, model.dawdling_m_s / behaviour.limit_m_s)
 
     queued = [follower for follower in behaviour.followers if tracks.classes[follower.track] == name]
-    headway = estimates.median_of([follower.headway_s for follower in queued])
+    headway = intervals.median_of([follower.headway_s for follower in queued])
     if headway is not None and headway.is_usable:
         attributes.comments.append(f"headway at the stop line {headway.value:.2f} s ({headway.format(2, 's')})")
     if not has_sizes:
@@ -158,7 +158,7 @@ def _attributes(name: str, tracks: CleanTracks, behaviour: _Behaviour, *, has_si
         return attributes
 
     standing_m = [gap_m for track, gap_m in behaviour.gaps_m.items() if tracks.classes[track] == name]
-    gap = estimates.median_of(standing_m)
+    gap = intervals.median_of(standing_m)
     min_gap_m = model.min_gap_m
     if gap is not None and gap.is_usable and gap.value > 0:
         min_gap_m = attributes.values["minGap"] = round(gap.value, 2)
@@ -171,7 +171,7 @@ def _attributes(name: str, tracks: CleanTracks, behaviour: _Behaviour, *, has_si
         for follower in queued
         if not math.isnan(follower.gap_m)
     ]
-    time_gap = estimates.median_of(time_gaps_s)
+    time_gap = intervals.median_of(time_gaps_s)
     if time_gap is not None and time_gap.is_usable and time_gap.value > 0:
         attributes.values["tau"] = round(time_gap.value, 2)
         attributes.comments.append(f"tau {time_gap.format(2, 's')}")
@@ -182,11 +182,11 @@ def _attributes(name: str, tracks: CleanTracks, behaviour: _Behaviour, *, has_si
 
 def _add_speed_factor(attributes: _KindAttributes, factors: Sequence[float], dawdling: float) -> None:
     """Add SUMO's speedFactor; ``dawdling`` is by how much drivers fall short of it, as a share of the limit."""
-    mean, deviation = estimates.mean_of(factors), estimates.deviation_of(factors)
+    mean, deviation = intervals.mean_of(factors), intervals.deviation_of(factors)
     if mean is None or deviation is None or not mean.is_usable:
         attributes.defaults["speedFactor"] = len(factors)
         return
-    mean = Estimate(mean.value + dawdling, mean.low + dawdling, mean.high + dawdling, mean.n)
+    mean = mean._replace(value=mean.value + dawdling, low=mean.low + dawdling, high=mean.high + dawdling)
     attributes.values["speedFactor"] = f"normc({mean.value:.3f},{deviation.value:.3f},0.2,2)"
     attributes.comments.append(f"speedFactor mean {mean.format(3)}; deviation {deviation.format(3)}")
 

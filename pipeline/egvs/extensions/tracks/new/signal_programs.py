@@ -44,9 +44,10 @@ from egvs.extensions.tracks.new.signal_assignment import (
 from egvs.extensions.tracks.new.signals import GREEN, RED, YELLOW, GroupOfEdges, RecordedSignals, SignalRecord
 from egvs.formats import xml
 from egvs.formats.georeference import WorldFrame
-from egvs.traffic import estimates, sumo
+from egvs.statistics import intervals
+from egvs.statistics.intervals import Estimate
+from egvs.traffic import sumo
 from egvs.traffic.approach_names import ApproachNames
-from egvs.traffic.estimates import Estimate
 from egvs.traffic.network import read_net_xml
 from egvs.traffic.signal_clock import SignalClock
 from egvs.traffic.signals import Phase, Program, replace_programs, request_bits
@@ -225,7 +226,7 @@ def apply_signals(
     if not cycles:
         hint = "Record longer: two beginnings of green of one group."
         raise InputError(where, "no complete cycle of the signals is recorded", hint)
-    lengths = estimates.median_of([cycle.length_s for cycle in cycles])
+    lengths = intervals.median_of([cycle.length_s for cycle in cycles])
     assert lengths is not None
     cycle = _typical_cycle(cycles, lengths.value, records)
     clock = None
@@ -513,7 +514,7 @@ def _notes(
     )
     texts = []
     for name, record in sorted(records.items(), key=lambda item: (len(item[0]), item[0])):
-        green = estimates.median_of(record.green_durations_s)
+        green = intervals.median_of(record.green_durations_s)
         offsets_s = [(start_s - cycle.begin_s) % cycle.length_s for start_s in record.green_starts_s]
         text = f"{name}: no complete green"
         if green is not None:
