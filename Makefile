@@ -8,7 +8,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # Every process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run environment test test-slow test-nightly test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics pictures schema reference docs notebooks fuzz clean
+.PHONY: run environment test test-slow test-nightly test-core test-extensions without test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics pictures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -40,6 +40,20 @@ test-lowest: $(VENV)/.installed
 # Without the modules and flags that only POSIX systems have: the unit tests of what depends on the system.
 test-portable: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m unit -p tests.without_posix --ignore=tests/extensions/validation/training
+
+EXTENSIONS := city hardware maps tracks validation
+
+# Each extension is taken away alone: imports, main commands, and the same artefacts as with all of them.
+without: $(VENV)/.installed-dev
+	$(BIN)/python .ci/without.py --each $(EXTENSIONS)
+
+# The tests of the core in a copy without any extension; those of extensions and of the complete program with all.
+test-core: $(VENV)/.installed-dev
+	$(BIN)/python .ci/without.py $(EXTENSIONS) --tests
+
+test-extensions: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m "not nightly" --ignore=tests/extensions/validation/training \
+		tests/extensions tests/benchmarks tests/docs tests/fuzz tests/install
 
 # The quick loop: no other program is started, nothing takes long.
 unit: $(VENV)/.installed-dev

@@ -1,19 +1,25 @@
 """Take extensions away in a copy of the repository, and show that the rest of the program works.
 
-usage: python .ci/without.py NAME... [--tests [PATH...]]
+usage: python .ci/without.py NAME... [--each] [--tests [PATH...]]
 
 The copy, in ``build/without``, has the tracked files without ``pipeline/egvs/extensions/NAME``, the tests of NAME and
 its entry points. Its wheel is built and unpacked, and comes before the installed package through PYTHONPATH. Then:
 
 1. every module can be imported, and no module names what is gone;
-2. ``egvs --help``, ``new``, ``run``, ``place``, ``report``, ``explore``, ``export`` and ``accuracy`` end with 0;
-3. with ``--tests``, the tests that are left pass, except slow ones.
+2. ``egvs --help`` lists no command of NAME, and each of them is refused with the name of the extension;
+3. ``new``, ``run``, ``place``, ``report``, ``explore``, ``export`` and ``accuracy`` end with 0, and write the same
+   artefacts as the complete program (``same.py``);
+4. with ``--tests`` instead of 3, the tests of the core pass, except nightly ones and :data:`COMPLETE_TESTS`.
+
+With ``--each``, one extension after the other is taken away alone.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -27,6 +33,12 @@ import tomlkit
 ROOT = Path(__file__).resolve().parent.parent
 BEGIN_S = time.monotonic()
 JUNCTION = ("scenarios/roundabout", "--set", "traffic.frames=200")
+
+COMPLETE_TESTS = ("tests/benchmarks", "tests/docs", "tests/fuzz", "tests/install")
+"""Tests of the complete program: pages, studies and damaged files of all its parts."""
+
+UNCOMPARED = ("accuracy", "store")
+"""What depends on the time that commands take: which settings a study tries, and records of costs."""
 
 IMPORT_ALL = """
 import importlib, importlib.metadata, pkgutil, sys
@@ -44,7 +56,7 @@ for entry in importlib.metadata.distribution("egvs").entry_points:
     if entry.value.startswith(prefixes):
         problems.append(f"entry point {entry}")
 print(egvs.__file__)
-sys.exit("; ".join(problems))
+sys.exit("; ".join(problems) or 0)
 """
 
 
@@ -52,17 +64,26 @@ def main() -> None:
     """Take the extensions away, and check what is left."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="+", metavar="NAME", help="folders of pipeline/egvs/extensions")
-    parser.add_argument("--tests", nargs="*", metavar="PATH", help="run the tests that are left, or those in PATH")
+    parser.add_argument("--each", action="store_true", help="take one after the other away, instead of all together")
+    parser.add_argument("--tests", nargs="*", metavar="PATH", help="run the tests of the core, or those in PATH")
     options = parser.parse_args()
 
-    copy = ROOT / "build" / "without" / "-".join(options.names)
-    copy_repository(copy)
-    prefixes = remove_extensions(copy, options.names)
-    reduced = ReducedProgram(copy)
-    reduced.check_modules(prefixes)
-    reduced.check_commands()
-    if options.tests is not None:
-        reduced.check_tests(options.tests or ["tests"])
+    expected = None
+    if options.tests is None:
+        expected = ROOT / "build" / "without" / "complete"
+        run_commands(Program(ROOT, expected))
+    for names in [[name] for name in options.names] if options.each else [options.names]:
+        copy = ROOT / "build" / "without" / "-".join(names)
+        copy_repository(copy)
+        prefixes = remove_extensions(copy, names)
+        reduced = ReducedProgram(copy)
+        reduced.check_modules(prefixes)
+        reduced.check_help(names)
+        if expected is None:
+            reduced.check_tests(options.tests or ["tests"])
+        else:
+            run_commands(reduced)
+            compare(expected, reduced.out)
     report("done")
 
 
@@ -101,32 +122,51 @@ def remove_extensions(copy: Path, names: Sequence[str]) -> tuple[str, ...]:
     return prefixes
 
 
-class ReducedProgram:
-    """The program without the extensions: the unpacked wheel of the copy."""
+class Program:
+    """The complete program, as it is installed.
 
-    def __init__(self, copy: Path) -> None:
-        self.copy, self.site = copy, copy / "site"
-        wheel = ["-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", "wheel", "."]
-        subprocess.run([sys.executable, *wheel], cwd=copy, check=True)
-        (built,) = (copy / "wheel").glob("*.whl")
-        with zipfile.ZipFile(built) as archive:
-            archive.extractall(self.site)
-        self.environment = {**os.environ, "PYTHONPATH": str(self.site), "EGVS_STORE": str(copy / "store")}
-        report("wheel built and unpacked")
+    Parameters
+    ----------
+    copy
+        The repository.
+    out
+        Folder for what its commands write; emptied.
+    """
 
-    def python(self, what: str, *arguments: object) -> str:
+    def __init__(self, copy: Path, out: Path) -> None:
+        self.copy, self.out = copy, out
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir(parents=True)
+        self.environment = {**os.environ, "EGVS_STORE": str(out / "store")}
+
+    def python(self, what: str, *arguments: object, expected: int = 0) -> str:
         """Run Python in the copy, and return what it prints; if it fails, end this program and say what failed."""
         words = [sys.executable, *(str(argument) for argument in arguments)]
         done = subprocess.run(words, cwd=self.copy, env=self.environment, capture_output=True, text=True)
-        if done.returncode:
+        if done.returncode != expected:
             sys.exit(f"{what} ended with {done.returncode}:\n{done.stdout}{done.stderr}")
-        return done.stdout
+        return done.stdout + done.stderr
 
     def egvs(self, *arguments: object) -> None:
         """Run a command of the program."""
         command = f"egvs {' '.join(str(argument) for argument in arguments)}"
         self.python(command, "-m", "egvs", *arguments)
         report(command)
+
+
+class ReducedProgram(Program):
+    """The program without the extensions: the unpacked wheel of the copy."""
+
+    def __init__(self, copy: Path) -> None:
+        super().__init__(copy, copy / "out")
+        self.site = copy / "site"
+        wheel = ["-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", "wheel", "."]
+        subprocess.run([sys.executable, *wheel], cwd=copy, check=True)
+        (built,) = (copy / "wheel").glob("*.whl")
+        with zipfile.ZipFile(built) as archive:
+            archive.extractall(self.site)
+        self.environment["PYTHONPATH"] = str(self.site)
+        report("wheel built and unpacked")
 
     def check_modules(self, prefixes: Sequence[str]) -> None:
         """Import every module, and look for names of what is gone in their texts."""
@@ -141,24 +181,53 @@ class ReducedProgram:
             sys.exit(f"these modules name what was taken away: {', '.join(naming)}")
         report("all modules can be imported; none names what was taken away")
 
-    def check_commands(self) -> None:
-        """Run the commands of the core."""
-        out = self.copy / "out"
-        self.egvs("--help")
-        self.egvs("new", out / "new", "--from", next((self.copy / "tests").rglob("small.osm")))
-        self.egvs("run", *JUNCTION, "--out", out / "run")
-        self.egvs("place", *JUNCTION, "--set", "placement.count=2", "--out", out / "run")
-        self.egvs("report", *JUNCTION, "--out", out / "run")
-        self.egvs("explore", out / "run", "--to", out / "view.html")
-        self.egvs("export", out / "run", "--to", "csv")
-        self.egvs("accuracy", *JUNCTION, "--out", out / "accuracy", "--budget", "20s")
+    def check_help(self, names: Sequence[str]) -> None:
+        """Check that the help lists no command of the extensions, and that each is refused with a reason."""
+        listed = re.findall(r"^\W*(\w[\w-]*)  ", self.python("egvs --help", "-m", "egvs", "--help"), re.MULTILINE)
+        if "run" not in listed:
+            sys.exit(f"egvs --help lists no command run: {listed}")
+        code = "import json; from egvs.cli.commands import SHIPPED; print(json.dumps(SHIPPED))"
+        shipped = json.loads(self.python("reading the commands of extensions", "-c", code))
+        for name in names:
+            for command in shipped.get(name, ()):
+                if command in listed:
+                    sys.exit(f"egvs --help lists {command}, a command of {name}")
+                printed = self.python(f"egvs {command}", "-m", "egvs", command, expected=2)
+                if f"the extension {name}" not in printed:
+                    sys.exit(f"egvs {command} does not say that it needs {name}: {printed}")
+        report("the help lists no command of what was taken away")
 
     def check_tests(self, paths: Sequence[str]) -> None:
-        """Run the tests that are left, except slow ones."""
+        """Run the tests of the core, except nightly ones."""
         environment = {**self.environment, "PYTHONPATH": f"{self.site}{os.pathsep}{self.copy}"}
-        words = [sys.executable, "-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", *paths]
+        words = [sys.executable, "-m", "pytest", "-q", "-m", "not nightly", "-p", "no:cacheprovider", *paths]
+        words += [f"--ignore={path}" for path in COMPLETE_TESTS]
         subprocess.run(words, cwd=self.copy, env=environment, check=True)
         report("tests")
+
+
+def run_commands(program: Program) -> None:
+    """Run the commands of the core."""
+    out = program.out
+    program.egvs("new", out / "new", "--from", next((ROOT / "tests").rglob("small.osm")))
+    program.egvs("run", *JUNCTION, "--out", out / "run")
+    program.egvs("place", *JUNCTION, "--set", "placement.count=2", "--out", out / "run")
+    program.egvs("report", *JUNCTION, "--out", out / "run")
+    program.egvs("explore", out / "run", "--to", out / "view.html")
+    program.egvs("export", out / "run", "--to", "csv")
+    program.egvs("accuracy", *JUNCTION, "--out", out / "accuracy", "--budget", "20s")
+
+
+def compare(expected: Path, out: Path) -> None:
+    """Compare what the complete and the reduced program wrote; ends this program if anything differs."""
+    for folder in sorted(path.name for path in expected.iterdir() if path.is_dir()):
+        if folder in UNCOMPARED:
+            continue
+        words = [sys.executable, ROOT / ".ci" / "same.py", expected / folder, out / folder]
+        done = subprocess.run(words, capture_output=True, text=True)
+        if done.returncode:
+            sys.exit(f"{folder} differs from that of the complete program:\n{done.stdout}{done.stderr}")
+    report("artefacts are those of the complete program")
 
 
 if __name__ == "__main__":

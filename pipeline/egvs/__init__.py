@@ -35,12 +35,9 @@ Several poses together, and plans with proven bounds on their quality::
     joint.gain("c10")
     egvs.place(egvs.load("scenarios/nishishinjuku", ["placement.count=3"])).certificate
 
-What a planner does next; the report of the run shows each result::
+What a planner does next; the report of the run shows the result::
 
     egvs.what_if("scenarios/nishishinjuku").answers
-    egvs.design_sensor(scenario, egvs.DesignRequest("c05", ("VLP-16", "VLP-32C")), "runs/trial").chosen
-    egvs.write_sheets("runs/trial", ["c03"])
-    egvs.write_acceptance("runs/trial", egvs.accept("runs/trial", "c03", ["measured.pcd"]))
 
 From maps to a scenario, and what accuracy and effects cost::
 
@@ -48,7 +45,8 @@ From maps to a scenario, and what accuracy and effects cost::
     egvs.run_accuracy_study("myplace", [], "runs/myplace", egvs.StudyOptions(egvs.Tolerance(1.0), budget_s=120.0))
     egvs.effect_statuses(egvs.load("myplace"), "runs/myplace")
 
-Names are imported when they are first used, so that ``import egvs`` costs nothing.
+Names are imported when they are first used, so that ``import egvs`` costs nothing. Those of an extension are imported
+from its package, for example ``from egvs.extensions.NAME import ...``.
 """
 
 from __future__ import annotations
@@ -66,16 +64,6 @@ if TYPE_CHECKING:
     from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
     from egvs.explore.settings import open_session
     from egvs.export.figure import draw_figure
-    from egvs.extensions.hardware.design import design_sensor
-    from egvs.extensions.hardware.design_request import DesignRequest
-    from egvs.extensions.hardware.fit.fit import fit_sensor
-    from egvs.extensions.hardware.fit.output import write_fit
-    from egvs.extensions.hardware.fit.sweep_files import read_sweeps
-    from egvs.extensions.hardware.installation.acceptance import accept
-    from egvs.extensions.hardware.installation.acceptance_page import write_acceptance
-    from egvs.extensions.hardware.installation.sheet import write_sheets
-    from egvs.extensions.validation.held_out_traffic import FrameSampling
-    from egvs.extensions.validation.site_validation import validate_sites
     from egvs.placement.plan import JointScore, place
     from egvs.results.studies import Tolerance
     from egvs.runs.run import run
@@ -96,9 +84,7 @@ if TYPE_CHECKING:
     from egvs.world.mesh import World
 
 __all__ = [
-    "DesignRequest",
     "EgvsError",
-    "FrameSampling",
     "InputError",
     "JointScore",
     "NewScenarioOptions",
@@ -115,21 +101,17 @@ __all__ = [
     "Tpog",
     "World",
     "__version__",
-    "accept",
     "build_scene",
     "compare_runs",
     "create_scenario",
-    "design_sensor",
     "draw_figure",
     "effect_statuses",
-    "fit_sensor",
     "load",
     "open_session",
     "place",
     "read_scans",
     "read_scores",
     "read_scores_by_period",
-    "read_sweeps",
     "read_tpog",
     "read_trajectories",
     "read_visibility",
@@ -137,12 +119,8 @@ __all__ = [
     "run_ablation",
     "run_accuracy_study",
     "shipped_scenario",
-    "validate_sites",
     "verify",
     "what_if",
-    "write_acceptance",
-    "write_fit",
-    "write_sheets",
 ]
 
 __getattr__, __dir__ = lazy_exports(
@@ -155,16 +133,6 @@ __getattr__, __dir__ = lazy_exports(
         "creation.new_scenario": ["NewScenarioOptions", "create_scenario"],
         "explore.settings": ["open_session"],
         "export.figure": ["draw_figure"],
-        "extensions.hardware.design": ["design_sensor"],
-        "extensions.hardware.design_request": ["DesignRequest"],
-        "extensions.hardware.fit.fit": ["fit_sensor"],
-        "extensions.hardware.fit.output": ["write_fit"],
-        "extensions.hardware.fit.sweep_files": ["read_sweeps"],
-        "extensions.hardware.installation.acceptance": ["accept"],
-        "extensions.hardware.installation.acceptance_page": ["write_acceptance"],
-        "extensions.hardware.installation.sheet": ["write_sheets"],
-        "extensions.validation.held_out_traffic": ["FrameSampling"],
-        "extensions.validation.site_validation": ["validate_sites"],
         "placement.plan": ["JointScore", "place"],
         "results.studies": ["Tolerance"],
         "runs.run": ["run"],

@@ -6,7 +6,6 @@ import pytest
 
 import egvs
 from egvs.cli import answer
-from egvs.extensions.validation.ranking_check import RankingCheck
 from egvs.report import sections
 from tests.results.test_ranking import by_vehicles
 
@@ -104,18 +103,3 @@ def test_details_only_on_request(mini: Path, tmp_path: Path, run_egvs) -> None:
     verbose, verbose_error = run_egvs("run", mini, "--out", tmp_path / "out", "--verbose")[1:]
     assert "voxels occupied at least once" not in error and "voxels occupied at least once" in verbose_error
     assert "peak MB" not in brief and "peak MB" in verbose
-
-
-def test_says_that_a_validation_of_this_run_contradicts_the_ranking(
-    mini: Path, tmp_path: Path, run_egvs, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    validate = ("validate", mini, "--out", out, "--frames", "10", "--detector", "points", "--jobs", "1")
-    assert run_egvs("run", mini, "--out", out)[0] == 0
-    assert run_egvs(*validate)[0] == 0
-    assert "contradicts" not in run_egvs("run", mini, "--out", out)[1]
-    monkeypatch.setattr(RankingCheck, "contradiction", "so")
-    printed = run_egvs("run", mini, "--out", out, "--rehash")[1]  # the program seems unchanged
-    assert f"The validation contradicts the ranking: so. See {out / 'report.html'}#detected" in printed
-    other = run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[1]
-    assert "contradicts" not in other  # the scores that were validated are others

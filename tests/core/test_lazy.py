@@ -5,19 +5,18 @@ from __future__ import annotations
 import importlib
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-PACKAGES = [
-    "egvs",
-    "egvs.artefacts",
-    "egvs.effects",
-    "egvs.placement",
-    "egvs.scenario",
-    "egvs.scoring",
-    "egvs.sensors",
-    "egvs.extensions.validation.detectors",
-]
+import egvs
+
+FOLDER = Path(egvs.__file__).parent
+PACKAGES = sorted(
+    ".".join(("egvs", *path.parent.relative_to(FOLDER).parts))
+    for path in FOLDER.rglob("__init__.py")
+    if "lazy_exports(" in path.read_text(encoding="utf-8")
+)
 HEAVY = ["numpy", "numba", "pyarrow", "pydantic", "shapely", "trimesh", "matplotlib", "embreex", "scipy", "onnxruntime"]
 
 

@@ -7,7 +7,7 @@ import re
 import typer
 from typer.core import TyperGroup
 
-from egvs.cli.app import COMMAND_GROUPS, app
+from egvs.cli.app import app
 from tests.docs.pages import DOCS, links, section
 
 PAGE = DOCS / "commands.md"
@@ -16,16 +16,16 @@ _ROW = re.compile(r"^\| `egvs ([\w -]+)` \| (.+) \| (.+) \|$", re.MULTILINE)
 
 def program_commands() -> list[str]:
     """Return all commands, those of a group with the name of the group, in the order of the help."""
-    commands = typer.main.get_command(app)
-    assert isinstance(commands, TyperGroup)
+    program = typer.main.get_command(app)
+    assert isinstance(program, TyperGroup)
+    context = program.make_context("egvs", [], resilient_parsing=True)
     names = []
-    for name in [name for group in COMMAND_GROUPS.values() for name in group]:
-        command = commands.commands[name]
+    for name in program.list_commands(context):
+        command = program.get_command(context, name)
         if isinstance(command, TyperGroup):
             names += [f"{name} {part}" for part in command.commands]
         else:
             names.append(name)
-    assert {name.split()[0] for name in names} == set(commands.commands)
     return names
 
 

@@ -36,7 +36,7 @@ def install(files: dict[str, str], folder: Path) -> Path:
     )
     (about / "entry_points.txt").write_text("\n".join(groups))
     for name, text in files.items():
-        if name.endswith(".py"):
+        if name != "pyproject.toml":
             (folder / name).write_text(text)
     return folder
 
@@ -57,7 +57,17 @@ def scores(folder: Path) -> list[float]:
     return list(egvs.read_scores(folder / "scores.parquet").column("egvs").to_pylist())
 
 
-@pytest.mark.parametrize("heading", ["An effect", "A format of point clouds", "A format of recorded tracks", "A score"])
+@pytest.mark.parametrize(
+    "heading",
+    [
+        "An effect",
+        "A format of point clouds",
+        "A format of recorded tracks",
+        "A score",
+        "A command",
+        "A section of the report",
+    ],
+)
 def test_the_example_is_short(heading: str) -> None:
     modules = [text for name, text in package(heading).items() if name.endswith(".py")]
     assert len(modules) == 1
@@ -188,3 +198,27 @@ assert ready.detect(Sweep(points[:0], beam[:0])).boxes.shape == (0, 7)
 """
     done = processes.python(code, beside=beside)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_a_command_and_a_section_of_other_packages_work(mini: Path, tmp_path: Path) -> None:
+    beside = install(package("A command"), tmp_path / "installed")
+    install(package("A section of the report"), beside)
+    out = tmp_path / "out"
+
+    code, text = run_egvs("visit", out, beside=beside)
+    assert code == 2 and "there are no scores in this folder. Run egvs run first." in text
+    code, text = run_egvs("run", mini, "--out", out, beside=beside)
+    assert code == 0 and "The visit contradicts" not in text, text
+    code, text = run_egvs("visit", out, "--sites", "1", beside=beside)
+    assert code == 0 and re.fullmatch(r"pole_[ab]: x -?[\d.]+ m, y -?[\d.]+ m\n", text), text
+    best = text.partition(":")[0]
+    assert "visit" in run_egvs("--help", beside=beside)[1]
+
+    (out / "visits.txt").write_text(f"{best}: impossible, a <gas> main\n")
+    code, text = run_egvs("run", mini, "--out", out, beside=beside)
+    assert code == 0 and f"The visit contradicts the ranking: no sensor can stand at {best}." in text, text
+    page = (out / "report.html").read_text()
+    assert f"<p><b>{best}</b>: impossible, a &lt;gas&gt; main</p>" in page
+    assert f'No sensor can stand at {best}: see the <a href="#visits">visit</a>.' in page

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,10 +13,8 @@ from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_tpog
 from egvs.core.files import add_checksum
 from egvs.drawing.run_figures import Figures
-from egvs.extensions.validation.ranking_check import DetectorCheck, RankCorrelation, RankingCheck
 from egvs.report import page
 from egvs.report.page import PageContents
-from egvs.report.sections import DetectorSummary, MeasureColumn, SiteDetection, ValidationSummary
 from egvs.results.ranking import Ranking
 from egvs.scenario.effects_config import EffectsConfig
 from tests.report.small_runs import (
@@ -337,32 +334,3 @@ def test_page_of_five_hundred_sites(tmp_path):
     assert len({name for title in titles for name in re.findall(r"g\d{3}", title)}) == 500, (
         "each tells its name on the map"
     )
-
-
-def test_headline_says_that_the_validation_contradicts_the_ranking(plain_run):
-    scenario, out, text = plain_run
-    assert "contradicts" not in text
-    ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
-    first, best = ranking.sites[0].site, ranking.sites[1].site
-    rho = RankCorrelation(0.1, -0.5, 0.6, 4)
-    losing = DetectorCheck(
-        "cluster", "mean AP of BEV and 3D", True, first, 0.5, best, 0.7, 0.01, 0.2, 0.02, 10, rho, None
-    )
-    found = {site.site: SiteDetection(0.5, 0.01, 1) for site in ranking.sites}
-    summary = DetectorSummary("cluster", (MeasureColumn("BEV AP", found), MeasureColumn("mean AP", found)))
-
-    def headline(check):
-        detected = ValidationSummary((summary,), RankingCheck("egvs", (check,)), 10, 18, 7.0, (), "")
-        contents = PageContents(scenario, ranking, tpog, Figures("", "", None, EMPTY_BACKDROP), {}, detected=detected)
-        html = page.render_page(contents)
-        read = PageReader(html)
-        assert "detected" in read.ids and "cluster BEV AP" in read.text and "cluster mean AP" in read.text
-        return read, html[html.index("<h1>") :].split("</h1>")[0]
-
-    read, title = headline(losing)
-    assert title.endswith(", but the validation contradicts this")
-    reason = f"With cluster, detection is better from {best} than from the first site, {first}, by 20.0 ± 2.0 AP points"
-    assert reason in read.text
-    assert read.fetched.count("#detected") == 1
-    read, title = headline(replace(losing, loss_se=0.2))
-    assert "contradicts" not in title and "contradicts" not in read.text

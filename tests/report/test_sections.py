@@ -18,54 +18,6 @@ from egvs.studies import study_settings
 from egvs.studies.accuracy import StudyOptions
 from tests.results.test_ranking import by_vehicles, ranking
 
-
-@pytest.mark.slow
-def test_shows_the_validation_of_the_same_run(mini, tmp_path, run_egvs):
-    out = tmp_path / "out"
-    validate = ("validate", mini, "--out", out, "--frames", "10", "--detector", "points", "--jobs", "1")
-
-    def section():
-        text = (out / "report.html").read_text()
-        return text[text.index('<section id="detected">') :].split("</section>")[0] if 'id="detected"' in text else ""
-
-    assert run_egvs("run", mini, "--out", out)[0] == 0
-    assert not section()
-    code, printed, error = run_egvs(*validate)
-    assert code == 0, error
-    text = html.unescape(section())
-    assert f"data:image/png;base64,{base64.b64encode((out / 'validation.png').read_bytes()).decode()}" in text
-    assert "in 10 frames of traffic, at least 2 s apart, with 18 vehicles in the region" in text
-    assert "2 sites are too few, or too similar, to tell whether EGVS predicts detection here" in text
-    assert "evaluated with the frames that the TPOG was computed from" in text and str(mini) not in text
-    for row in parquet.read_artefact(out / "detection.parquet", "detection")[0].to_pylist():
-        if row["objects_of"] == "vehicles":
-            assert f"{100 * row['seen_20']:.1f} ± {100 * row['seen_20_se']:.1f}" in text
-    assert str(out / "report.html") in printed
-    assert run_egvs("verify", out)[0] == 0
-
-    assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
-    assert not section()  # the scores that were validated are others
-    assert run_egvs(*validate, "--set", "score.gamma=3.0")[0] == 0
-    assert section()
-    (out / "detection.parquet").unlink()
-    assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
-    assert not section()
-
-
-@pytest.mark.slow
-def test_rejects_a_damaged_validation(mini, tmp_path, run_egvs):
-    out = tmp_path / "out"
-    assert run_egvs("validate", mini, "--out", out, "--frames", "10", "--detector", "points", "--jobs", "1")[0] == 0
-    (out / "correlation.parquet").write_bytes(b"PAR1")
-    code, _, error = run_egvs("run", mini, "--out", out)
-    assert code == 2
-    assert "correlation.parquet: does not match its checksum in validation.sha256. Remove it, or" in error
-    (out / "validation.sha256").unlink()
-    code, _, error = run_egvs("run", mini, "--out", out)
-    assert code == 2
-    assert "correlation.parquet, which no run wrote" in error
-
-
 EGVS = egvs_setting(2.0, 0.25)
 
 

@@ -12,6 +12,7 @@ import pytest
 import egvs
 from egvs.core import files
 from tests.conftest import collection, fcd
+from tests.installed import needs
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -80,8 +81,10 @@ def test_run_does_not_overwrite_input(mini: Path, run_egvs, put, message: str, v
 STUDIES = {
     "accuracy, its results": (("accuracy",), "accuracy/f.csv"),
     "accuracy, its table": (("accuracy",), "accuracy.parquet"),
-    "validate, what it keeps": (("validate", "--keep"), "validation_kitti/f.csv"),
-    "validate, its scores": (("validate",), "surrogates.parquet"),
+    "validate, what it keeps": pytest.param(
+        ("validate", "--keep"), "validation_kitti/f.csv", marks=needs("validation")
+    ),
+    "validate, its scores": pytest.param(("validate",), "surrogates.parquet", marks=needs("validation")),
 }
 
 
@@ -96,6 +99,7 @@ def test_study_does_not_overwrite_input(mini: Path, run_egvs, words: tuple[str, 
     assert tree(mini) == before
 
 
+@needs("validation")
 def test_rejects_input_in_results_folder(mini: Path, tmp_path: Path, run_egvs) -> None:
     theirs = tmp_path / "out" / "validation_kitti"
     theirs.mkdir(parents=True)
@@ -108,7 +112,9 @@ FOREIGN = ("statics.ply", "scores.parquet", "tpog.parquet", "report.html", "accu
            "placement.parquet", "sumo/mine.net.xml")  # fmt: skip
 
 
-@pytest.mark.parametrize("verb", ["run", "statics", "score", "accuracy", "validate", "place"])
+@pytest.mark.parametrize(
+    "verb", ["run", "statics", "score", "accuracy", pytest.param("validate", marks=needs("validation")), "place"]
+)
 @pytest.mark.parametrize("name", FOREIGN)
 def test_run_does_not_overwrite_file_that_no_run_wrote(
     mini: Path, tmp_path: Path, run_egvs, verb: str, name: str
@@ -191,6 +197,7 @@ def test_rejects_link_in_sumo_folder(mini: Path, tmp_path: Path, run_egvs, place
     assert (code, error) == (2, f"egvs: {link}: {what}\n")
 
 
+@needs("validation")
 @pytest.mark.parametrize("place", ["validation_kitti", ".validation_kitti.partial", "validation_kitti/pole_a"])
 def test_rejects_link_in_detections_folder(mini: Path, tmp_path: Path, run_egvs, place: str) -> None:
     link = tmp_path / "out" / place

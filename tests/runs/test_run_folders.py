@@ -22,6 +22,7 @@ from egvs.runs import locks, run_list, run_sources
 from egvs.runs.run import lock_run_folder
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.settings import format_overrides
+from tests.installed import needs
 
 OTHER = Path("runs/mini@gamma=5")
 
@@ -327,6 +328,7 @@ def test_effects_of_a_run_name_its_scenario_and_overrides(here: Path, run_egvs: 
     assert f"egvs accuracy {OTHER}" in printed.replace("'", "")
 
 
+@needs("validation")
 @pytest.mark.slow
 def test_accuracy_and_validation_of_a_run_are_written_into_it(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here, ["score.gamma=5"]))
@@ -340,7 +342,9 @@ def test_accuracy_and_validation_of_a_run_are_written_into_it(here: Path, run_eg
     assert [path.name for path in Path("runs").iterdir()] == [OTHER.name]
 
 
-@pytest.mark.parametrize("verb", ["place", "validate", "accuracy", "effects", "check"])
+@pytest.mark.parametrize(
+    "verb", ["place", pytest.param("validate", marks=needs("validation")), "accuracy", "effects", "check"]
+)
 def test_rejects_overrides_of_a_run(here: Path, run_egvs: Any, verb: str) -> None:
     egvs.run(egvs.load(here))
     code, _, message = run_egvs(verb, "runs/mini", "--set", "score.gamma=5")

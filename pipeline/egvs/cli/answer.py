@@ -25,6 +25,7 @@ from egvs.cli.options import DEFAULT_POLES
 from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import by_number, number_of
 from egvs.report import ranking_text, reliability, sections
+from egvs.report.extension_sections import read_sections
 from egvs.report.sensor_text import range_note
 from egvs.results.labels import ScoreLabel, join_names
 from egvs.results.ranking import Pole, RankedSite, Ranking
@@ -106,9 +107,9 @@ def _print_ranking(
 ) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
     print_sentences([verdict(ranked, ranking_text.recorded_frames_hint(scenario, ranked, record.stages))])
-    validation = sections.ValidationSummary.read(folder, record.stages)
-    if validation is not None and validation.check.warning:
-        print_sentences([f"{validation.check.warning} See {RunFolder(folder).report}#detected"])
+    for part in read_sections(RunFolder(folder), record.stages):
+        for warning in part.warnings:
+            print_sentences([f"{warning.sentence} See {RunFolder(folder).report}#{part.section.name}"])
     summary = record.stages["score"].summary
     if ranked.by.counts_vehicles and "weights" in summary:
         print_sentences([f"Vehicles are weighted: {summary['weights']}."])

@@ -1,6 +1,7 @@
 """The command line ``egvs``: each verb parses its options, calls the program, and prints the result.
 
-Verbs with several tables are in modules of their own (``place``, ``validate``, ``city``). Heavy modules are imported by
+Verbs with several tables are in modules of their own (``place``, ``compare``); those of extensions are found through
+entry points (:mod:`egvs.cli.commands`). Heavy modules are imported by
 the verb that needs them, so that ``egvs --help`` is quick.
 """
 
@@ -16,6 +17,7 @@ from typer.models import CommandInfo
 from egvs._version import __version__
 from egvs.cli import compare, exit, place, sources, what_if
 from egvs.cli import options as cli_options
+from egvs.cli.commands import PANELS, ExtensibleGroup
 from egvs.cli.options import (
     DEFAULT_POLES,
     Audit,
@@ -31,10 +33,6 @@ from egvs.cli.options import (
     Verbose,
 )
 from egvs.core.errors import InputError
-from egvs.extensions.city import commands as city
-from egvs.extensions.hardware import installation_commands as installation
-from egvs.extensions.hardware import sensor_commands as sensor
-from egvs.extensions.validation import commands as validate
 
 if TYPE_CHECKING:
     from egvs.scenario.model import Scenario
@@ -43,6 +41,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="egvs",
+    cls=ExtensibleGroup,
     help="Rank candidate sites for roadside LiDARs by how well they see the traffic.",
     no_args_is_help=True,
     add_completion=False,
@@ -481,10 +480,6 @@ def _write_page_file(
     print(f"{page.path}  ({page.size_bytes / 1e6:.1f} MB; {page.duration_s:.0f} s of traffic from {sensors}; {drawn})")
 
 
-for verb in validate.VERBS:
-    app.command()(verb)
-
-
 # ---- files of a run
 
 
@@ -549,16 +544,7 @@ def figure(
     print(path)
 
 
-app.command()(installation.sheets)
-app.command()(installation.accept)
-
-
-app.add_typer(city.app, name="city")
-
-
 # ---- scenarios, sensors, cached results
-
-app.add_typer(sensor.app, name="sensor")
 
 
 @app.command()
@@ -831,21 +817,11 @@ def store(
 
 # ---- egvs --help
 
-COMMAND_GROUPS = {
-    "Start here": ("new", "demo", "check", "run"),
-    "Decide": ("place", "explore", "compare", "what-if", "city"),
-    "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
-    "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
-    "Install": ("sheets", "accept"),
-    "Files": ("runs", "export", "figure", "sensors", "verify", "store", "sensor"),
-}
-"""Groups of ``egvs --help``, and their commands."""
-
 
 def _group_commands() -> None:
-    """Show the commands in their groups, in the order of :data:`COMMAND_GROUPS`."""
-    order = [name for names in COMMAND_GROUPS.values() for name in names]
-    group_of = {name: group for group, names in COMMAND_GROUPS.items() for name in names}
+    """Show the commands in their panels, in the order of :data:`egvs.cli.commands.PANELS`."""
+    panel_of = {name: panel for panel, names in PANELS.items() for name in names}
+    order = list(panel_of)
 
     def command_name(info: CommandInfo) -> str:
         assert info.callback is not None
@@ -853,10 +829,7 @@ def _group_commands() -> None:
 
     app.registered_commands.sort(key=lambda info: order.index(command_name(info)))
     for command in app.registered_commands:
-        command.rich_help_panel = group_of[command_name(command)]
-    for group in app.registered_groups:
-        assert group.name is not None
-        group.rich_help_panel = group_of[group.name]
+        command.rich_help_panel = panel_of[command_name(command)]
 
 
 _group_commands()

@@ -13,7 +13,7 @@ from egvs.cli.console import Column, console, make_table
 from egvs.cli.run_tables import format_age, format_size
 from egvs.cli.sources import format_setting
 from egvs.core.wording import list_first
-from egvs.extensions.city import results
+from egvs.export.folder_kinds import find_kind
 from egvs.results.labels import SCORE_LABELS
 from egvs.runs.run_list import ListedRun
 
@@ -83,10 +83,6 @@ def describe_run(run: ListedRun, now_s: float) -> str:
     return "\n".join(lines)
 
 
-def _is_city(run: ListedRun) -> bool:
-    return (run.folder / results.JUNCTIONS_TABLE).is_file()
-
-
 def _format_scenario(run: ListedRun) -> str:
     """Return the scenario's folder, relative to the present one if it is below."""
     if run.problem:
@@ -101,8 +97,8 @@ def _format_overrides(run: ListedRun) -> str:
 
 
 def _format_state(run: ListedRun) -> str:
-    if _is_city(run):
-        return "city run"
+    if (kind := find_kind(run.folder)) is not None:
+        return kind.state
     if run.problem:
         return run.problem
     if run.missing:

@@ -28,11 +28,11 @@ _REQUIREMENTS = {
     ),
     "egvs.detectors": (
         ("NAME", "SOURCE", "settings", "at_site"),
-        "a class with NAME, SOURCE, settings and at_site, see egvs.extensions.validation.detectors.base",
+        "a class with NAME, SOURCE, settings and at_site, see detectors.base of the extension validation",
     ),
     "egvs.scores": (
         ("name", "formula", "source", "sign", "function"),
-        "a SurrogateScore, see egvs.extensions.validation.surrogates",
+        "a SurrogateScore, see surrogates of the extension validation",
     ),
     "egvs.maps": (
         ("NAME", "can_open"),

@@ -1,5 +1,6 @@
-"""Exports a run or a city: vector layers as GeoPackage, GeoJSON, GeoParquet, KML or CSV, rasters as GeoTIFF; of a run
-also a site plan as DXF and a 3D scene as glTF or USD.
+"""Exports a run, or a folder of several, as vector layers: GeoPackage, GeoJSON, GeoParquet, KML or CSV.
+
+Of a run also rasters as GeoTIFF, a site plan as DXF, and a 3D scene as glTF or USD.
 
 Steps: check the request; open the run and choose the reference system; make the layers or rasters; write the files to a
 temporary folder, and move them to their names when all are complete.
@@ -21,15 +22,12 @@ from egvs.core.errors import InputError, unknown_site
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.export import drawing, scene_files
 from egvs.export.finished_run import CRS_CHOICES, SCENARIO_CRS, WGS84_CRS, ExportCrs, FinishedRun
+from egvs.export.folder_kinds import find_kind
 from egvs.export.layers import (
     NAMES,
     Layer,
     best_site,
-    city_layers,
-    city_name,
-    is_city,
     kml_layers,
-    open_junction_run,
     run_layers,
 )
 
@@ -53,8 +51,8 @@ class Format:
         Optional libraries that write the format.
     extra
         The extra that installs them.
-    of_city
-        Whether a city can be exported.
+    needs_run
+        Whether it shows what only a run has, so that other folders with layers cannot be exported.
     """
 
     name: str
@@ -63,7 +61,7 @@ class Format:
     crs: str
     libraries: tuple[str, ...] = ()
     extra: str = "gis"
-    of_city: bool = True
+    needs_run: bool = False
 
 
 _FORMATS = (
@@ -72,10 +70,10 @@ _FORMATS = (
     Format("geoparquet", ".parquet", False, SCENARIO_CRS, ("geopandas",)),
     Format("kml", ".kml", True, WGS84_CRS),
     Format("csv", ".csv", False, SCENARIO_CRS),
-    Format("geotiff", ".tif", False, SCENARIO_CRS, ("rasterio",), of_city=False),
-    Format("dxf", ".dxf", True, SCENARIO_CRS, ("ezdxf",), of_city=False),
-    Format("glb", ".glb", False, SCENARIO_CRS, of_city=False),
-    Format("usd", ".usdc", False, SCENARIO_CRS, ("pxr",), extra="usd", of_city=False),
+    Format("geotiff", ".tif", False, SCENARIO_CRS, ("rasterio",), needs_run=True),
+    Format("dxf", ".dxf", True, SCENARIO_CRS, ("ezdxf",), needs_run=True),
+    Format("glb", ".glb", False, SCENARIO_CRS, needs_run=True),
+    Format("usd", ".usdc", False, SCENARIO_CRS, ("pxr",), extra="usd", needs_run=True),
 )
 _METRES = ("dxf", "glb", "usd")
 """Formats without degrees."""
@@ -100,12 +98,12 @@ def export_run(
     sites: Collection[str] = (),
     progress: ProgressCallback = no_progress,
 ) -> ExportResult:
-    """Export a finished run, or a city.
+    """Export a finished run, or a folder of several (:mod:`egvs.export.folder_kinds`).
 
     Parameters
     ----------
     folder
-        Folder of the run or of the city.
+        The folder.
     to
         One of :data:`FORMATS`.
     crs
@@ -132,16 +130,15 @@ def export_run(
         If the libraries are not installed.
     """
     file_format = _check_request(to, crs, sites)
-    of_city = is_city(folder)
-    if of_city:
-        if not file_format.of_city:
-            hint = f"Export a junction: {folder / 'junctions' / 'NAME'}."
-            raise InputError(f"--to {to}", f"{folder} is the folder of a city", hint)
-        run = open_junction_run(folder)
-        title = city_name(folder)
-    else:
+    kind = find_kind(folder)
+    if kind is None:
         run = FinishedRun.open(folder)
         title = run.scenario.name
+    elif file_format.needs_run:
+        raise InputError(f"--to {to}", f"{folder} is the folder of a {kind.name}", kind.part_hint(folder))
+    else:
+        run = kind.reference_run(folder)
+        title = kind.title(folder)
     reference = _export_crs(run, file_format, crs)
     selected = _selected_sites(run, sites)
     target = out or _default_target(folder, file_format, title)
@@ -161,8 +158,8 @@ def export_run(
             written = list(scene_files.write_scene(temp_folder, run, reference, is_usd=to == "usd"))
             progress("files written", 1, 1)
         else:
-            layers, notes = city_layers(folder) if of_city else run_layers(run)
-            if file_format.name == "kml" and not of_city:
+            layers, notes = run_layers(run) if kind is None else kind.layers(folder)
+            if file_format.name == "kml" and kind is None:
                 layers = kml_layers(run, layers, notes)
             progress("layers made", 1, 2)
             if file_format.name == "dxf":

@@ -1,8 +1,7 @@
-"""Vector layers of a run or a city, their colours, and their QGIS styles.
+"""Vector layers of a run, their colours, and their QGIS styles; the latter also for layers of extensions.
 
-Layers of a run: candidate sites, the plan, blind spots, footprints, the region. Layers of a city: junctions, the plan,
-the candidate sites and the regions of all junctions. Geometries are shapely's, in the world frame, metres, seen from
-above. Column names end in their unit, as in the artefacts.
+Layers of a run: candidate sites, the plan, blind spots, footprints, the region. Geometries are shapely's, in the world
+frame, metres, seen from above. Column names end in their unit, as in the artefacts.
 
 The colours are those of the report, in a few classes. Styles are QML files as QGIS writes them
 (https://docs.qgis.org/latest/en/docs/user_manual/appendices/qgis_file_formats.html). They are made for each run,
@@ -15,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -26,18 +24,16 @@ from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core.errors import InputError
 from egvs.drawing import colours
 from egvs.drawing.basemap import network_file, union_of_triangles
 from egvs.export.finished_run import FinishedRun
-from egvs.extensions.city import results
 from egvs.sensors.sensor import scenario_sensor
 from egvs.traffic import network
 
 JUNCTIONS, SITES, PLAN, MISSED, MISSED_LANES, FOOTPRINTS, REGION = NAMES = (
     "junctions", "sites", "plan", "blindspots", "blindspot_lanes", "footprints", "region",
 )  # fmt: skip
-"""Layers, the topmost first; only a city has junctions."""
+"""Layers, the topmost first; a run has no junctions."""
 
 _GROUND, _CELL, _LANE = "ground", "cell", "lane"
 _RESERVED = ("fid", "ogc_fid", "geom", "geometry", "wkt")
@@ -267,10 +263,10 @@ _MIN_AREA_M2 = 2e-6
 
 
 def _region_layer(run: FinishedRun) -> Layer:
-    return Layer(REGION, _region_geometries([run]), pa.Table.from_pylist([_region_row(run)]))
+    return Layer(REGION, region_geometries([run]), pa.Table.from_pylist([region_row(run)]))
 
 
-def _region_row(run: FinishedRun) -> dict[str, Any]:
+def region_row(run: FinishedRun) -> dict[str, Any]:
     box = run.scenario.roi.box
     return {
         "name": run.scenario.name, "low_m": box.origin_m[2], "high_m": box.origin_m[2] + box.size_m[2],
@@ -278,7 +274,7 @@ def _region_row(run: FinishedRun) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _region_geometries(runs: Sequence[FinishedRun]) -> NDArray[np.object_]:
+def region_geometries(runs: Sequence[FinishedRun]) -> NDArray[np.object_]:
     """Return the rectangle of the region of interest of each run."""
     import shapely
 
@@ -314,63 +310,6 @@ def to_plain_table(table: pa.Table) -> pa.Table:
         used.add(name.lower())
         columns[name] = column
     return pa.table(columns)
-
-
-_JUNCTION_COLUMN = "junction"
-
-
-def is_city(folder: Path) -> bool:
-    """Return whether a folder is that of a city run."""
-    return (folder / results.JUNCTIONS_TABLE).is_file()
-
-
-def city_name(folder: Path) -> str:
-    """Return the name of a city."""
-    return str(parquet.read_metadata(folder / results.JUNCTIONS_TABLE, "city")["city"]["name"])
-
-
-def open_junction_run(folder: Path) -> FinishedRun:
-    """Open the run of the first junction of a city; all have the same reference system."""
-    return FinishedRun.open(results.junction_run_folder(folder, _junction_names(folder)[0]))
-
-
-def city_layers(folder: Path) -> tuple[list[Layer], list[str]]:
-    """Return the layers of a city, the topmost first, and notes on those that are left out.
-
-    InputError if the scores of a junction have changed since the city run.
-    """
-    rows, metadata = parquet.read_artefact(folder / results.JUNCTIONS_TABLE, "city")
-    if metadata["inputs"] != results.hash_scores(folder, _junction_names(folder)):
-        problem = "the scores of a junction have changed since the city run"
-        raise InputError(folder / results.JUNCTIONS_TABLE, problem, "Run egvs city run again.")
-    layers, notes = [Layer(JUNCTIONS, point_geometries(rows), to_plain_table(rows), "gain")], list[str]()
-    scores = results.read_city_scores(folder)
-    planned = results.read_plan(folder, _junction_names(folder))
-    if planned is not None and planned.sensors:
-        sensors, _ = parquet.read_artefact(folder / results.PLAN_TABLE, "city_plan")
-        layers.append(Layer(PLAN, point_geometries(sensors), to_plain_table(sensors)))
-    elif planned is None and (folder / results.PLAN_TABLE).is_file():
-        notes.append("the plan is left out: it is for other junctions or settings. Run egvs city place again")
-    first = ["rank", *(name for name in scores.column_names if name != "rank")]
-    layers.append(Layer(SITES, point_geometries(scores), to_plain_table(scores.select(first)), metadata["rank_by"]))
-    layers.append(_city_region_layer(folder))
-    return layers, notes
-
-
-def _city_region_layer(folder: Path) -> Layer:
-    """The regions of interest of all junctions."""
-    names = _junction_names(folder)
-    runs = [FinishedRun.open(results.junction_run_folder(folder, name)) for name in names]
-    rows = [{_JUNCTION_COLUMN: name, **_region_row(run)} for name, run in zip(names, runs, strict=True)]
-    return Layer(REGION, _region_geometries(runs), pa.Table.from_pylist(rows))
-
-
-def _junction_names(folder: Path) -> list[str]:
-    """Names of the junctions, sorted."""
-    names: list[str] = (
-        parquet.read_artefact(folder / results.JUNCTIONS_TABLE, "city")[0].column(_JUNCTION_COLUMN).to_pylist()
-    )
-    return sorted(names)
 
 
 N_CLASSES = 9

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, MIN_VEHICLES, PeriodRanking
-from egvs.artefacts.run_folder import ACCURACY_FILES, COMMAND_RESULTS, PLACEMENT_FILES, VALIDATION_FILES, RunFolder
+from egvs.artefacts.run_folder import ACCURACY_FILES, COMMAND_RESULTS, PLACEMENT_FILES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord, traffic_summary
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
@@ -29,12 +29,18 @@ from egvs.drawing.run_figures import Figures
 from egvs.report.approach_fits import ApproachFit, compare_approaches
 from egvs.report.approach_map import busiest_counts, draw_approach_map
 from egvs.report.command_sections import CommandSections
+from egvs.report.extension_sections import (
+    SectionContents,
+    read_sections,
+    report_sections,
+    section_modules,
+    template_name,
+)
 from egvs.report.points_section import MAPPED_POLES, PointsSection
 from egvs.report.ranking_text import entropy_seen_note, headline, lead, recorded_frames_hint
 from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
-    ValidationSummary,
     assumes_flows,
     assumptions,
     describe_counts,
@@ -78,7 +84,6 @@ _OPTIONAL_FILES = (
     RunFolder.zones.name,
     RunFolder.plan_zones.name,
     *ACCURACY_FILES,
-    *VALIDATION_FILES,
     *PLACEMENT_FILES,
     *(file.name for file in COMMAND_RESULTS),
 )
@@ -103,7 +108,7 @@ class PageContents:
     ----------
     stages
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
-    study, by_period, detected, plan
+    study, by_period, plan
         Results of other commands and of periods; None if those commands have not run.
     commands
         Results of what-ifs, sheets, acceptance checks and sensor design.
@@ -115,6 +120,8 @@ class PageContents:
         Observed and simulated queues and speeds.
     approach_map
         SVG with the names and counts of the approaches; empty without counts.
+    sections
+        Sections of extensions.
     """
 
     scenario: Scenario
@@ -124,7 +131,6 @@ class PageContents:
     stages: Mapping[str, StageRecord]
     study: Mapping[str, Any] = field(default_factory=lambda: {"study": None})
     by_period: PeriodRanking | None = None
-    detected: ValidationSummary | None = None
     plan: Mapping[str, Any] | None = None
     movements: Mapping[str, str] = field(default_factory=dict)
     commands: CommandSections = field(default_factory=CommandSections)
@@ -132,6 +138,7 @@ class PageContents:
     points: PointsSection | None = None
     approaches: tuple[ApproachFit, ...] = ()
     approach_map: str = ""
+    sections: tuple[SectionContents, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -174,6 +181,8 @@ def dependencies(work: StageContext) -> StageDependencies:
     else:
         scan = scan_dependencies(work)
         settings["scan"], hashes = scan.settings, dict(scan.files)
+    for section in report_sections():
+        names += section.files
     hashes |= work.digests(*(name for name in (*names, *_OPTIONAL_FILES) if work.path(name).is_file()))
     network = work.inputs.common_network_path
     if network is not None:
@@ -190,7 +199,9 @@ def dependencies(work: StageContext) -> StageDependencies:
             summaries[name] = summary
     costs = {name: [stage.cost.seconds, stage.cost.peak_mb] for name, stage in stages.items()}
     warnings = [stage.summary.get(WARNINGS_KEY, []) for stage in stages.values()]
-    return StageDependencies(settings, hashes, {"costs": costs, "summaries": summaries, "warnings": warnings})
+    more = {"costs": costs, "summaries": summaries, "warnings": warnings}
+    more["sections"] = {template_name(section): files.hash_file(section.template) for section in report_sections()}
+    return StageDependencies(settings, hashes, more, section_modules())
 
 
 def _displayed_settings(scenario: Scenario) -> dict[str, Any]:
@@ -252,7 +263,6 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         stages,
         study=study_values(work.folder, stages),
         by_period=PeriodRanking.read(out),
-        detected=ValidationSummary.read(out, stages),
         plan=None if plan is None else plan_values(plan, ranking.sites, tpog, drawn.backdrop),
         commands=CommandSections.of(
             current_entries(work.folder, work.scenario, stages),
@@ -264,6 +274,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
         approaches=approaches,
         approach_map=draw_approach_map(work.scenario, network_file(out)),
+        sections=read_sections(work.folder, stages),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)
@@ -303,7 +314,12 @@ def prepare() -> None:
 
 @cache
 def _template_environment() -> Environment:
+    from jinja2 import ChoiceLoader, FileSystemLoader, PrefixLoader  # only when a page is written
+
     environment = pages.page_environment(TEMPLATES)
+    assert environment.loader is not None
+    folders = {section.name: FileSystemLoader(section.template.parent) for section in report_sections()}
+    environment.loader = ChoiceLoader([environment.loader, PrefixLoader(folders)])
     environment.globals |= {
         "choose": (TEMPLATES / "choose.js").read_text(encoding="utf-8"),
         "separable": DISTINCT_PROBABILITY,
@@ -394,7 +410,6 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     setting = egvs_setting(scenario.gamma, tpog.grid.voxel_m, moving_occlusion=has_occlusion)
     return {
         "headline": headline(ranking, bool(tpog.counts.any())),
-        "contradiction": "" if contents.detected is None else contents.detected.check.contradiction,
         "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
         "disagreement": ranking_disagreement(ranking.sites, setting, detectors=scenario.score.detectors),

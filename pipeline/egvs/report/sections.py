@@ -1,4 +1,4 @@
-"""Sections of the page on the results of other commands: ``egvs validate``, ``egvs place``, ``egvs accuracy``.
+"""Sections of the page on the results of other commands: ``egvs place``, ``egvs accuracy``.
 
 A result is shown if it was computed from the same inputs as the run.
 
@@ -12,21 +12,18 @@ import base64
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from egvs.artefacts.readers import read_validation
-from egvs.artefacts.run_folder import VALIDATION_FILES, RunFolder
-from egvs.artefacts.run_record import StageRecord, have_inputs
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import StageRecord
 from egvs.artefacts.tpog import Tpog
-from egvs.core.errors import Diagnostic, collect_warnings
+from egvs.core.errors import Diagnostic
 from egvs.core.wording import format_percent
 from egvs.drawing import maps, svg_figures
 from egvs.drawing.maps import Backdrop, PlannedPole
 from egvs.drawing.svg_figures import CurveStep
-from egvs.extensions.validation.ranking_check import RankingCheck
 from egvs.report import plan_answer
 from egvs.results.labels import SCORE_LABELS, join_names
 from egvs.results.plans import PlannedSensor, SensorPlan
@@ -68,137 +65,9 @@ _SITES_ON_LANES = "sites on lanes"
 _TRAFFIC = re.compile(r"\btraffic\b(?! (?:light|sign))", re.IGNORECASE)
 """Found in entries of the key ``assumed`` on traffic; traffic lights and signs are not traffic."""
 
-_ALL_OBJECTS = "vehicles"
-"""Name of the set of all objects in ``detection.parquet``."""
-
-_MEASURE_TITLES = {"ap_mean_r40_iou70": "mean AP", "seen_20": "20 points"}
-"""Titles of main measures, in ``detection.parquet``."""
-
-_FURTHER_MEASURES = {"ap_mean_r40_iou70": (("ap_bev_r40_iou70", "BEV AP"), ("ap_3d_r40_iou70", "3D AP"))}
-"""Columns and titles of measures that are shown beside a main one."""
-
 
 def _read_base64(path: Path) -> str:
     return base64.b64encode(path.read_bytes()).decode("ascii")
-
-
-# ---- egvs validate
-
-
-@dataclass(frozen=True)
-class SiteDetection:
-    """Detection from a site by one detector.
-
-    Attributes
-    ----------
-    value, se
-        A share and its standard error; None if not defined.
-    rank
-        1 is best, equal values share a rank; None without a value.
-    """
-
-    value: float | None
-    se: float | None
-    rank: int | None
-
-
-@dataclass(frozen=True)
-class MeasureColumn:
-    """One measure of a detector: its title, and the values by name of the site."""
-
-    title: str
-    sites: Mapping[str, SiteDetection]
-
-
-@dataclass(frozen=True)
-class DetectorSummary:
-    """What one detector finds from the sites.
-
-    Attributes
-    ----------
-    name
-        The detector.
-    columns
-        Its measures that the page shows; the last is the main one, whose ranks are shown.
-    """
-
-    name: str
-    columns: tuple[MeasureColumn, ...]
-
-    @property
-    def main(self) -> MeasureColumn:
-        """The main measure."""
-        return self.columns[-1]
-
-
-@dataclass(frozen=True)
-class ValidationSummary:
-    """Results of ``egvs validate``.
-
-    Attributes
-    ----------
-    detectors
-        What each detector finds.
-    check
-        What the detectors say about the ranking.
-    frames, objects
-        Frames of the traffic used, and vehicles in them.
-    apart_s
-        Minimum time between two frames.
-    warnings
-        Warnings of the validation.
-    figure
-        PNG in base 64.
-    """
-
-    detectors: tuple[DetectorSummary, ...]
-    check: RankingCheck
-    frames: int
-    objects: int
-    apart_s: float
-    warnings: tuple[Diagnostic, ...]
-    figure: str
-
-    @classmethod
-    def read(cls, out: Path, stages: Mapping[str, StageRecord]) -> ValidationSummary | None:
-        """Read the validation in a run folder; None if there is none of this run."""
-        detection, correlation, figure = (out / name for name in VALIDATION_FILES)
-        if not figure.is_file():
-            return None
-        result = read_validation(detection, correlation)
-        if result is None:
-            return None
-        detection_rows, _, metadata = result
-        if not have_inputs(stages, metadata["stages"]):
-            return None
-        rows = [row for row in detection_rows if row["objects_of"] == _ALL_OBJECTS]
-        names = dict.fromkeys(row["detector"] for row in rows)
-        return cls(
-            detectors=tuple(_detector_summary(name, metadata["shown"][name], rows) for name in names),
-            check=RankingCheck.from_json(metadata["ranking"]),
-            frames=metadata["frames"],
-            objects=rows[0]["objects"],
-            apart_s=metadata["apart_s"],
-            warnings=tuple(collect_warnings([metadata])),
-            figure=_read_base64(figure),
-        )
-
-
-def _detector_summary(name: str, measure: str, rows: Sequence[Mapping[str, Any]]) -> DetectorSummary:
-    rows = [row for row in rows if row["detector"] == name]
-    columns = []
-    for column, title in (*_FURTHER_MEASURES.get(measure, ()), (measure, _MEASURE_TITLES.get(measure, measure))):
-        values = [row[column] for row in rows if not math.isnan(row[column])]
-        sites = {row["site"]: _site_detection(row[column], row[f"{column}_se"], values) for row in rows}
-        columns.append(MeasureColumn(title, sites))
-    return DetectorSummary(name, tuple(columns))
-
-
-def _site_detection(value: float, se: float, values: Sequence[float]) -> SiteDetection:
-    if math.isnan(value):
-        return SiteDetection(None, None, None)
-    known_se = None if math.isnan(se) else se
-    return SiteDetection(value, known_se, 1 + sum(other > value for other in values))
 
 
 # ---- what the ranking rests on

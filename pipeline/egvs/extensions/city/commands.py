@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from egvs.cli import options
+from egvs.cli.commands import Command
 from egvs.core.wording import format_percent, number_of
 
 if TYPE_CHECKING:
@@ -390,3 +391,5 @@ app = typer.Typer(no_args_is_help=True, help="Run every junction of a city, on o
 
 for verb in (new, traffic, run, place, compare):
     app.command()(verb)
+
+COMMANDS = (Command("city", "Decide", app),)

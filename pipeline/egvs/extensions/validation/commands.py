@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from egvs.cli import options, sources
+from egvs.cli.commands import Command
 from egvs.cli.options import Jobs, Out, ScenarioPath, Set, SettingsPath
 from egvs.core.errors import InputError, MissingBackendError
 
@@ -172,5 +173,4 @@ def train(
     validation_tables.print_training(model, metadata)
 
 
-VERBS = (validate, clouds, scores, train)
-"""In the order of the help."""
+COMMANDS = tuple(Command(verb.__name__, "Study", verb) for verb in (validate, scores, clouds, train))

@@ -16,6 +16,7 @@ import pytest
 import egvs
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.extensions import hardware
 from egvs.extensions.hardware.installation import acceptance, scan_comparison
 from egvs.extensions.hardware.installation.acceptance import Acceptance, PoseError, accept
 from egvs.extensions.hardware.installation.acceptance_limits import Limits
@@ -346,9 +347,9 @@ def test_report_shows_the_sheet_and_the_verdict_while_they_belong_to_the_run(ins
     """1.5 degrees of tilt fail; after a run with another gamma, neither is shown."""
     folder = installed.folder.parent / "reported"
     shutil.copytree(installed.folder, folder)
-    egvs.write_sheets(folder, ["pole_a"], kind="svg")
+    hardware.write_sheets(folder, ["pole_a"], kind="svg")
     scan = installed.write("tilted_for_report.pcd", installed.points(pitch_deg=1.5))
-    written = egvs.write_acceptance(folder, egvs.accept(folder, "pole_a", [scan]))
+    written = hardware.write_acceptance(folder, hardware.accept(folder, "pole_a", [scan]))
     assert [path.name for path in written[2:]] == ["acceptance.json", "report.html"]
     text = (folder / "report.html").read_text(encoding="utf-8")
     assert 'href="sheets/installation_pole_a.svg"' in text

@@ -1,0 +1,111 @@
+"""Commands of extensions: entry points of the group ``egvs.commands``, each a tuple of :class:`Command`.
+
+They are read only for ``egvs --help`` and for a command that the core does not have, so that the core's commands start
+as quickly with any number of extensions. A command of the core cannot be replaced.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from egvs.core import plugins
+from egvs.core.errors import MissingBackendError
+
+GROUP = "egvs.commands"
+"""The group of entry points."""
+
+PANELS = {
+    "Start here": ("new", "demo", "check", "run"),
+    "Decide": ("place", "explore", "compare", "what-if"),
+    "Study": ("accuracy", "effects"),
+    "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
+    "Files": ("runs", "export", "figure", "sensors", "verify", "store"),
+}
+"""Panels of ``egvs --help``, and the commands of the core in them."""
+
+SHIPPED = {
+    "city": ("city",),
+    "hardware": ("accept", "sensor", "sheets"),
+    "validation": ("clouds", "scores", "train", "validate"),
+}
+"""Extensions that come with this program, and their commands: for messages where one was taken away."""
+
+
+class Command(NamedTuple):
+    """A command of an extension.
+
+    Attributes
+    ----------
+    name
+        What users type after ``egvs``.
+    panel
+        Panel of ``egvs --help`` that lists it; a panel that the core lacks comes before its last one.
+    app
+        A function as for ``typer.Typer.command``, or a Typer app with commands of its own.
+    """
+
+    name: str
+    panel: str
+    app: typer.Typer | Callable[..., None]
+
+
+class ExtensibleGroup(TyperGroup):
+    """The commands of the core, and those of extensions once they are needed."""
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command of the core, else of an extension; None if there is no such command."""
+        if cmd_name not in self.commands:
+            for extension in plugins.plugin_names(GROUP):
+                self._add(extension)
+        return super().get_command(ctx, cmd_name)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of all commands, by panel; an extension that cannot be loaded is reported and left out."""
+        for extension in plugins.plugin_names(GROUP):
+            try:
+                self._add(extension)
+            except MissingBackendError as error:
+                print(error, file=sys.stderr)
+        panel_of = {name: command.rich_help_panel for name, command in self.commands.items()}
+        *first, last = PANELS
+        new = [panel for panel in panel_of.values() if panel not in PANELS]
+        panels = list(dict.fromkeys([*first, *new, last]))
+        return sorted(panel_of, key=lambda name: panels.index(panel_of[name]))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that the arguments name; an error names the extension that has it."""
+        for extension, names in SHIPPED.items():
+            if args[0] in names and self.get_command(ctx, args[0]) is None:
+                ctx.fail(f"{args[0]!r} needs the extension {extension}, which is not installed.")
+        return super().resolve_command(ctx, args)
+
+    def _add(self, extension: str) -> None:
+        for name, command in extension_commands(extension).items():
+            self.commands.setdefault(name, command)
+
+
+@cache
+def extension_commands(extension: str) -> dict[str, TyperCommand]:
+    """Load the commands of an extension, by name.
+
+    Raises
+    ------
+    MissingBackendError
+        When the entry point cannot be loaded, or is no tuple of :class:`Command`.
+    """
+    declared = plugins.load_plugin(GROUP, extension)
+    if not (isinstance(declared, tuple) and all(isinstance(command, Command) for command in declared)):
+        raise plugins.plugin_error(GROUP, extension, "expected a tuple of egvs.cli.commands.Command")
+    holder = typer.Typer(add_completion=False)
+    for command in declared:
+        if isinstance(command.app, typer.Typer):
+            holder.add_typer(command.app, name=command.name, rich_help_panel=command.panel)
+        else:
+            holder.command(command.name, rich_help_panel=command.panel)(command.app)
+    return dict(typer.main.get_group(holder).commands)

@@ -1,0 +1,85 @@
+"""Sections of extensions: found by entry points, shown with their warnings, and part of what the report depends on."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from egvs.artefacts.run_folder import RunFolder
+from egvs.core.errors import MissingBackendError
+from egvs.report import extension_sections, page
+from tests.core.test_plugins import clear_caches, install
+from tests.report.small_runs import PageReader, render_report, run_to_scores
+from tests.stage_runner import inputs_of
+
+MODULE = """
+from pathlib import Path
+from egvs.report.extension_sections import SectionWarning
+
+class Notes:
+    name = "notes"
+    files = ("notes.txt",)
+    template = Path(__file__).with_name("notes.html.j2")
+
+    def read(self, folder, stages):
+        path = folder / "notes.txt"
+        return path.read_text().split() if path.is_file() else None
+
+    def warnings(self, values):
+        if "stop" in values:
+            yield SectionWarning("Stop: it rains.", "a note says stop", "it rains", "note")
+
+SECTION = Notes()
+"""
+TEMPLATE = """<section id="notes"><h2>Notes</h2>{% for word in section %}<p>{{ word }}</p>{% endfor %}</section>"""
+
+
+def forget_sections() -> None:
+    clear_caches()
+    extension_sections.report_sections.cache_clear()
+    page._template_environment.cache_clear()
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder on the path in which an extension is installed."""
+    folder = tmp_path / "site"
+    install(folder, "notes", "notes = plug_notes:SECTION", {"plug_notes": MODULE}, extension_sections.GROUP)
+    (folder / "notes.html.j2").write_text(TEMPLATE)
+    monkeypatch.syspath_prepend(str(folder))
+    forget_sections()
+    yield folder
+    forget_sections()
+    sys.modules.pop("plug_notes", None)
+
+
+def test_page_shows_the_section_and_its_warning(site: Path, tmp_path: Path) -> None:
+    scenario, out = run_to_scores(tmp_path / "run")
+    assert "notes" not in PageReader(render_report(scenario, out)).ids
+    (out / "notes.txt").write_text("go <b>")
+    text = render_report(scenario, out)
+    assert "<p>go</p><p>&lt;b&gt;</p></section>" in text and "a note says" not in text
+    (out / "notes.txt").write_text("stop")
+    text = render_report(scenario, out)
+    assert ", but a note says stop</h1>" in text
+    assert '<p class="lede">It rains: see the <a href="#notes">note</a>.</p>' in text
+
+
+def test_files_template_and_module_are_inputs_of_the_report(site: Path, tmp_path: Path) -> None:
+    scenario, out = run_to_scores(tmp_path / "run")
+    (out / "notes.txt").write_text("go")
+    before = inputs_of(page, scenario, out)
+    (out / "notes.txt").write_text("stop")
+    assert (changed := inputs_of(page, scenario, out)) != before
+    (site / "notes.html.j2").write_text(TEMPLATE + "<p>more</p>")
+    assert inputs_of(page, scenario, out) != changed
+    assert "plug_notes" in extension_sections.section_modules()
+
+
+def test_rejects_object_that_is_no_section(site: Path) -> None:
+    (site / "plug_notes.py").write_text("SECTION = 7")
+    with pytest.raises(MissingBackendError, match="expected an object with name, files, template, read and warnings"):
+        extension_sections.read_sections(RunFolder(site), {})
