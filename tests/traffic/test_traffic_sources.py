@@ -19,7 +19,7 @@ MESSAGE = "needs the extension tracks"
 
 
 class SmallSource:
-    """A source whose module is named by the scenario's only file."""
+    """A source of seven frames that names one module."""
 
     KEYS = ("tracks",)
 
