@@ -126,7 +126,7 @@ def source_of(scenario: Scenario) -> TrafficSource:
     key = source_key(scenario.traffic)
     assert key is not None, "a recording is named"
     for name in plugins.plugin_names(GROUP):
-        source = load_source(name)
+        source: TrafficSource = load_source(name)
         if key in source.KEYS:
             return source
     raise missing_extension(f"{sumo_folder.traffic_location(scenario)}.{key}")
