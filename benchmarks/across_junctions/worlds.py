@@ -37,6 +37,9 @@ NOTE = "made_from.json"
 BASE, WITH_TABLES = "base", "scenario"
 NETWORK, TERRAIN = "roads.net.xml", "terrain.asc"
 
+_RECORDINGS = "egvs.extensions.tracks.new.traffic"
+"""Reads recorded people and signals of new scenarios; it is loaded by name."""
+
 EASTING_M, NORTHING_M, EPSG = 500_000.0, 5_500_000.0, 32632
 """Where x = y = 0 of a generated network lies, so that a terrain file fits it."""
 
@@ -92,7 +95,7 @@ def make_world(protocol: Protocol, junction: Junction, maps: Path | None, folder
             "fleet": [kind.model_dump(mode="json") for kind in protocol.fleets.get(junction.fleet, ())],
             "tpog_frames": protocol.tpog_frames,
             "program": [
-                stage_keys.source_digest(new_scenario.__name__).digest,
+                stage_keys.source_digest(new_scenario.__name__, _RECORDINGS).digest,
                 *(files.hash_file(Path(module.__file__ or "")) for module in (furniture, sys.modules[__name__])),
             ],
         }

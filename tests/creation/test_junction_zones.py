@@ -21,7 +21,7 @@ ROUNDABOUT = Path(__file__).parents[2] / "scenarios" / "roundabout" / "network.n
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[Zone, ...]]:
     folder = tmp_path_factory.mktemp("zones") / "made"
-    return folder, create_scenario(folder, SMALL, walk=True).zones
+    return folder, create_scenario(folder, SMALL, walk=True).region.zones
 
 
 def test_crossroads_has_a_zone_of_each_kind_on_each_side(made: tuple[Path, tuple[Zone, ...]]) -> None:

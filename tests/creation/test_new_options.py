@@ -13,6 +13,7 @@ from shapely.geometry import LineString, MultiLineString, Point
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
 from egvs.creation import assumed_traffic, building_heights, junctions, new_scenario, scenario_files
+from egvs.creation.assumed_traffic import AssumedTraffic
 from egvs.creation.new_scenario import NewScenario
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network
@@ -72,9 +73,9 @@ def write_all_solids(folder: Path, extract: Path) -> None:
 def test_solids_beyond_sensor_range_are_left_out_with_a_note(tmp_path: Path) -> None:
     plain = create_scenario(tmp_path / "plain", SMALL)
     summary = create_scenario(tmp_path / "far", with_far_objects(tmp_path))
-    assert summary.statics.dropped["out_of_range"] == {"building": 1, "tree": 1}
-    assert summary.statics.objects == plain.statics.objects
-    total = 2 + plain.statics.objects.total() - plain.statics.objects["tree_crown"]
+    assert summary.statics.counts.dropped["out_of_range"] == {"building": 1, "tree": 1}
+    assert summary.statics.counts.objects == plain.statics.counts.objects
+    total = 2 + plain.statics.counts.objects.total() - plain.statics.counts.objects["tree_crown"]
     assert f"2 of {total} static objects are left out: they are beyond the range of a VLP-32C (200 m) from" in str(
         summary.notes
     )
@@ -113,13 +114,13 @@ def print_new(summary: NewScenario, capsys: pytest.CaptureFixture[str]) -> str:
 
 def test_distance_from_requested_position_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     near = create_scenario(tmp_path / "near", SMALL, at=(52.0003, 10.0))
-    assert near.from_at_m == pytest.approx(33.4 - junction_half_depth_m(near), abs=0.5)
+    assert near.region.from_at_m == pytest.approx(33.4 - junction_half_depth_m(near), abs=0.5)
     printed = print_new(near, capsys)
-    assert f"at 52.00000,10.00000, {near.from_at_m:.0f} m from --at" in printed
+    assert f"at 52.00000,10.00000, {near.region.from_at_m:.0f} m from --at" in printed
     assert printed.count("warning:") == 1
 
     without = create_scenario(tmp_path / "without", SMALL)
-    assert without.from_at_m is None
+    assert without.region.from_at_m is None
     assert "the largest of the map; --at chooses another" in print_new(without, capsys)
 
 
@@ -130,9 +131,10 @@ def junction_half_depth_m(summary: NewScenario) -> float:
 
 def test_junction_far_from_requested_position_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     far = create_scenario(tmp_path / "far", SMALL, at=(52.0008, 10.0))
-    assert far.from_at_m is not None and far.from_at_m > new_scenario.FAR_FROM_AT_M
+    from_at_m = far.region.from_at_m
+    assert from_at_m is not None and from_at_m > new_scenario.FAR_FROM_AT_M
     assert (
-        f"warning: the junction ({far.junction.title}) is {far.from_at_m:,.0f} m from --at and may not be the one"
+        f"warning: the junction ({far.junction.title}) is {from_at_m:,.0f} m from --at and may not be the one"
         in print_new(far, capsys)
     )
 
@@ -173,7 +175,7 @@ def test_requested_vehicles_per_hour_are_written(tmp_path: Path, total_per_h: in
     summary = create_scenario(tmp_path / "out", SMALL, traffic=total_per_h)
     counts = loading.load(tmp_path / "out").traffic.counts
     assert sum(flow.per_hour for flow in counts) == total_per_h
-    assert summary.traffic is not None
+    assert isinstance(summary.traffic, AssumedTraffic)
     assert summary.traffic.summary == f"carries all of the {total_per_h:,} requested vehicles an hour"
     assumed = loading.load(tmp_path / "out").assumed
     assert assumed[0] == f"shares of the movements (of {total_per_h:,} vehicles an hour)"

@@ -101,7 +101,7 @@ def test_network_is_cut_on_request(tmp_path: Path) -> None:
     grid = netgenerate(tmp_path / "map", "--grid", "--grid.number", "4", "--grid.length", "120", name="grid.net.xml")
     whole = create_scenario(tmp_path / "whole", grid, at=(120.0, 120.0))
     cut = create_scenario(tmp_path / "cut", grid, at=(120.0, 120.0), surroundings_m=130.0)
-    assert (cut.junction.id, cut.roi) == (whole.junction.id, whole.roi)
+    assert (cut.junction.id, cut.region.roi) == (whole.junction.id, whole.region.roi)
     before, after = ({edge.id: edge for edge in made.streets.network.edges} for made in (whole, cut))
     assert after.keys() < before.keys()
     for name, edge in after.items():
@@ -215,7 +215,7 @@ def test_footprint_is_cut_at_the_carriageway() -> None:
 def test_building_of_another_map_replaces_that_of_openstreetmap(tmp_path: Path) -> None:
     small = Path(__file__).parent / "data" / "small.osm"
     plain = create_scenario(tmp_path / "plain", small)
-    n_buildings = plain.statics.objects["building"]
+    n_buildings = plain.statics.counts.objects["building"]
     assert n_buildings > 0
     counts = ImportCounts()
     building = MappedSolid("way/1", "building", box(100, 100, 110, 110), 9.0, "default")

@@ -20,6 +20,7 @@ from shapely.geometry import LineString, Point, shape
 from egvs.cli import app, new_summary
 from egvs.core.errors import InputError
 from egvs.creation import assumed_traffic, new_scenario
+from egvs.creation.assumed_traffic import AssumedTraffic
 from egvs.creation.map_parts import ImportCounts
 from egvs.creation.openstreetmap import reader as openstreetmap
 from egvs.formats import osm
@@ -93,7 +94,7 @@ def edited(tmp_path: Path, *changes: tuple[str, str]) -> Path:
 
 # --- what is in the scenario ---------------------------------------------------------------------------------------
 def test_heights_by_source(made: Made) -> None:
-    heights = made[1].statics.heights
+    heights = made[1].statics.counts.heights
     assert heights["building"] == {"height": 5, "levels": 3, "neighbours": 3}
     assert heights["roof"] == {"type": 1}
     assert heights["tree"] == {"height": 1, "default": 7}
@@ -102,7 +103,7 @@ def test_heights_by_source(made: Made) -> None:
 
 
 def test_counts_changed_and_dropped_objects(made: Made) -> None:
-    counted = made[1].statics
+    counted = made[1].statics.counts
     assert counted.unreadable == {"height": 1}
     assert counted.repaired == 1
     assert counted.cut == {"building": 1, "barrier": 1}
@@ -132,7 +133,7 @@ def test_sizes_from_the_map_are_not_assumed() -> None:
 
 def test_every_object_is_used_or_counted(footprints: dict[str, Any], made: Made) -> None:
     complete = Counter(f["properties"]["kind"] for name, f in footprints.items() if not name.endswith("#2"))
-    assert complete == made[1].statics.objects
+    assert complete == made[1].statics.counts.objects
 
 
 @pytest.mark.parametrize(
@@ -359,8 +360,8 @@ def test_counts_open_ring(tmp_path: Path) -> None:
     deleted = ('<node id="1" ', '<node id="77" action="delete"/><node id="1" ')
     torn = edited(tmp_path, (' <way id="2102">.*?</way>', ""), deleted)
     summary = create_scenario(tmp_path / "torn", torn)
-    assert summary.statics.dropped["incomplete"] == {"building": 2}
-    assert summary.statics.heights["building"]["levels"] == 2
+    assert summary.statics.counts.dropped["incomplete"] == {"building": 2}
+    assert summary.statics.counts.heights["building"]["levels"] == 2
 
 
 # --- a real town ---------------------------------------------------------------------------------------------------
@@ -376,10 +377,10 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Made:
 def test_real_town(town: Made) -> None:
     folder, summary = town
     assert "Meisebacher Straße" in summary.junction.title and summary.junction.signalised
-    assert summary.traffic is not None and summary.traffic.assumed_per_h > 1000
-    assert summary.statics.heights["building"] == {"levels": 1, "default": 262}
-    assert summary.statics.objects["tree_trunk"] == 10
-    assert summary.statics.dropped["out_of_range"] == {"barrier": 2, "building": 379, "pole": 18, "tree": 5}
+    assert isinstance(summary.traffic, AssumedTraffic) and summary.traffic.assumed_per_h > 1000
+    assert summary.statics.counts.heights["building"] == {"levels": 1, "default": 262}
+    assert summary.statics.counts.objects["tree_trunk"] == 10
+    assert summary.statics.counts.dropped["out_of_range"] == {"barrier": 2, "building": 379, "pole": 18, "tree": 5}
     assert loading.load(folder).roi.grid.shape == (360, 320, 20)
     check_sites(folder, 12)
 
@@ -527,7 +528,7 @@ def test_rejects_folder_with_content(tmp_path: Path) -> None:
 def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: str, share: float) -> None:
     summary = create_scenario(tmp_path / "out", SMALL, traffic=level)
     traffic = summary.traffic
-    assert traffic is not None and traffic.capacity.is_everything
+    assert isinstance(traffic, AssumedTraffic) and traffic.capacity.is_everything
     assert traffic.carried_per_h == traffic.assumed_per_h > 500
     assert [flow.per_hour for flow in summary.flows] == [round(flow.per_hour * share) for flow in traffic.assumed]
     assert traffic.summary == (
@@ -544,7 +545,7 @@ def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch
     runs = (jam, TrialRun(0.7, 70, 70, 50.0, 0))
     monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: Capacity(0.644, runs))
     traffic = create_scenario(tmp_path / "out", SMALL).traffic
-    assert traffic is not None
+    assert isinstance(traffic, AssumedTraffic)
     assert traffic.carried_per_h == 10 * round(0.0644 * traffic.assumed_per_h)
     assert traffic.summary == f"carries {traffic.carried_per_h:,} vehicles an hour; medium 75 % is used"
     assert traffic.per_h == pytest.approx(0.75 * traffic.carried_per_h, abs=12)
@@ -570,7 +571,7 @@ def test_smaller_surroundings_keep_sites_and_flows(tmp_path: Path) -> None:
         assert len({(tmp_path / str(r) / name).read_bytes() for r in made}) == 1
     flows = [sorted(flow.per_hour for flow in summary.flows) for summary in made.values()]
     assert flows[0] == flows[1] == flows[2] and len(flows[0]) == 12 and sum(flows[0]) > 500
-    assert len({summary.roi for summary in made.values()}) == 1
+    assert len({summary.region.roi for summary in made.values()}) == 1
     assert loading.load(tmp_path / "inf").traffic.counts == made[math.inf].flows
 
 

@@ -102,7 +102,7 @@ def test_flyover_is_no_traffic_but_a_deck(tmp_path: Path) -> None:
     made = create_scenario(tmp_path / "flyover", path)
 
     assert made.flows == plain.flows
-    region = made.roi.area
+    region = made.region.roi.area
     roads = road_network.read_net_xml(tmp_path / "flyover" / "network.net.xml").edges
     inside = {edge.id.lstrip("-").partition("#")[0] for edge in roads if made.streets.areas[edge.id].intersects(region)}
     assert inside == {"1001", "1002"}

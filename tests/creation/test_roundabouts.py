@@ -171,7 +171,7 @@ def test_real_roundabout_is_one_junction(tmp_path: Path) -> None:
         pytest.skip(f"{REAL.name} is not beside the checkout (shared/real)")
     summary = create_scenario(tmp_path / "out", REAL, at=(50.8600, 9.7100))
     assert summary.junction.title == "roundabout of Berliner Straße and Europaallee"
-    assert (summary.junction.arms, summary.from_at_m) == (4, 0.0)
+    assert (summary.junction.arms, summary.region.from_at_m) == (4, 0.0)
     assert len(summary.flows) == 12
     check_sites(tmp_path / "out", 12)
     poles = [Point(float(row["x_m"]), float(row["y_m"])) for row in sites_of(tmp_path / "out")]

@@ -565,7 +565,7 @@ def sensors(
     run_tables.print_sensor_details([CATALOGUE[name] for name in names])
 
 
-@app.command(cls=cli_options.PolesCommand)
+@app.command(cls=cli_options.NewCommand)
 def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the new scenario.")],
     more: Annotated[

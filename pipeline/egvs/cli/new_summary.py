@@ -16,14 +16,11 @@ from egvs.creation import junctions
 from egvs.creation.map_parts import OUT_OF_RANGE, ImportCounts
 from egvs.creation.new_scenario import NewScenario
 from egvs.creation.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
-from egvs.extensions.tracks.new import files as recorded_traffic
-from egvs.extensions.tracks.recorded_tracks import track_warnings
+from egvs.scenario.model import SCENARIO_FILE
 
 if TYPE_CHECKING:
-    from egvs.creation.assumed_traffic import AssumedTraffic
     from egvs.creation.junctions import Streets
     from egvs.creation.static_objects import MapSummary
-    from egvs.extensions.tracks.new.demand import TrackDemand
 
 _FILE_WIDTH = 160
 
@@ -43,25 +40,19 @@ def print_new_scenario(scenario: NewScenario, map_notes: Sequence[str] = ()) -> 
 
 
 def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
-    junction, roi = scenario.junction, scenario.roi
+    junction, region, statics = scenario.junction, scenario.region, scenario.statics
+    width_m, depth_m = region.roi.size_m
     arms = f"{number_of(junction.arms, 'arm')}, {number_of(junction.lanes_in, 'incoming lane')}"
     yield "junction", f"{junction.title}: {arms}; {_position(scenario)}"
-    yield "region", f"{roi.size_m[0]:g} m x {roi.size_m[1]:g} m x {scenario.height_m:g} m around the junction"
+    yield "region", f"{width_m:g} m x {depth_m:g} m x {region.height_m:g} m around the junction"
     yield "streets", describe_streets(scenario.streets)
-    traffic = _describe_traffic(scenario.traffic)
-    if scenario.recorded is not None:
-        traffic = recorded_traffic.describe(scenario.recorded)
-    if scenario.demand is not None:
-        traffic = scenario.demand.describe()
-    if scenario.counted is not None:
-        traffic = scenario.counted.describe()
-    yield "traffic", traffic
+    yield "traffic", scenario.traffic.describe()
     mounts = f"{len(junctions.HEIGHTS_M)} heights x {len(PITCHES_DEG)} tilts"
     yield "sites", f"{scenario.n_candidates:,} candidates: {scenario.poles} poles x {mounts}, sensor {SENSOR}"
-    yield "solids", describe_solids(scenario.statics, scenario.n_solids)
-    if left_out := describe_dropped(scenario.statics):
+    yield "solids", describe_solids(statics.counts, statics.n_solids)
+    if left_out := describe_dropped(statics.counts):
         yield "", f"left out: {left_out} (all counts: {STATICS_FILE})"
-    for summary in scenario.maps if len(scenario.maps) > 1 or scenario.maps_have_notes else ():
+    for summary in statics.maps if len(statics.maps) > 1 or statics.maps_have_notes else ():
         yield "map", _describe_map(summary)
         for note in summary.notes:
             yield "", note
@@ -79,10 +70,11 @@ def _describe_map(summary: MapSummary) -> str:
 def _position(scenario: NewScenario) -> str:
     """Return the position of the junction, and its distance from the requested one."""
     position = f"at {scenario.streets.format_position(scenario.junction.at_m)}"
-    if scenario.from_at_m is None:
-        is_free = scenario.recorded is None and scenario.demand is None
-        return f"{position}, the largest of the map; --at chooses another" if is_free else position
-    return f"{position}, {scenario.from_at_m:,.0f} m from --at"
+    if scenario.region.from_at_m is not None:
+        return f"{position}, {scenario.region.from_at_m:,.0f} m from --at"
+    if scenario.traffic.is_recorded:
+        return position
+    return f"{position}, the largest of the map; --at chooses another"
 
 
 def describe_streets(streets: Streets) -> str:
@@ -91,13 +83,6 @@ def describe_streets(streets: Streets) -> str:
     return (
         f"{number_of(len(streets.network.edges), 'edge')}, {length}, {number_of(signalised, 'junction')} with signals"
     )
-
-
-def _describe_traffic(traffic: AssumedTraffic | None) -> str:
-    if traffic is None:
-        return "none: no street leads vehicles through the region"
-    movements = number_of(len(traffic.flows), "movement")
-    return f"the junction {traffic.summary}: {traffic.per_h:,} vehicles an hour in {movements} (assumed)"
 
 
 def describe_solids(counts: ImportCounts, n_solids: int | None = None) -> str:
@@ -123,43 +108,10 @@ def describe_dropped(counts: ImportCounts) -> str:
 
 
 def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
-    if scenario.is_far_from_at:
-        distance = f"{scenario.from_at_m:,.0f} m from --at"
+    if scenario.region.is_far_from_at:
+        distance = f"{scenario.region.from_at_m:,.0f} m from --at"
         yield (
             f"the junction ({scenario.junction.title}) is {distance} and may not be the one that you mean."
             " Check the position, and that the map contains the junction."
         )
-    if scenario.recorded is not None:
-        for warning in track_warnings(scenario.recorded, f"{scenario.folder / 'scenario.toml'}: traffic.tracks"):
-            yield str(warning)
-        return
-    if scenario.demand is not None:
-        yield from _demand_warnings(scenario, scenario.demand)
-        return
-    if scenario.counted is not None:
-        return
-    assumed, per_h = "the traffic is assumed", 0
-    if scenario.traffic is not None:
-        per_h = scenario.traffic.per_h
-        if scenario.traffic.level is None:
-            assumed = "the shares of the movements are assumed"
-    yield (
-        f"{assumed} ({per_h:,} vehicles an hour); this affects the ranking."
-        f" Enter counted traffic under [traffic] in {scenario.folder / 'scenario.toml'} before you rely on the ranking,"
-        " and remove its entry from assumed."
-    )
-
-
-def _demand_warnings(scenario: NewScenario, demand: TrackDemand) -> Iterator[str]:
-    """Warn about counts from few vehicles, and about tracks beside the lanes."""
-    from egvs.statistics.intervals import MIN_OBSERVATIONS  # loads scipy.stats
-
-    where = scenario.folder / "scenario.toml"
-    if demand.marked:
-        yield (
-            f"{demand.marked} of {len(demand.movements)} counts come from fewer than {MIN_OBSERVATIONS} vehicles. Enter"
-            f" your own counts under [traffic] in {where}; they are marked there, with their intervals."
-        )
-    if demand.alignment is not None:
-        for warning in demand.alignment.warnings("--like"):
-            yield str(warning)
+    yield from scenario.traffic.warnings(scenario.folder / SCENARIO_FILE)

@@ -188,8 +188,24 @@ def pole_spacing_m(rule: str, spacing: str) -> float:
     return spacing_m
 
 
-class PolesCommand(TyperCommand):
-    """A command that accepts ``--poles 20m`` and ``--poles "every 20m"`` for ``--poles every 20m``."""
+_RECORDING_OPTIONS = ("tracks", "like", "pedestrian_tracks", "signals", "track_columns", "track_crs")
+"""Parameters of ``egvs new`` that need an extension."""
+
+
+class NewCommand(TyperCommand):
+    """``egvs new``: accepts ``--poles 20m`` and ``--poles "every 20m"`` for ``--poles every 20m``.
+
+    Its help hides options for recordings where no installed extension reads them.
+    """
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help."""
+        from egvs.traffic import traffic_sources
+
+        for parameter in self.params:
+            if parameter.name in _RECORDING_OPTIONS and not traffic_sources.is_installed():
+                parameter.hidden = True  # type: ignore[attr-defined]
+        super().format_help(ctx, formatter)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Replace a spacing in one word by the two words that the option expects."""

@@ -7,15 +7,21 @@ what the network carries of them without a lock, see :mod:`egvs.traffic.capacity
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import tomlkit
 
 from egvs.core.errors import InputError
-from egvs.core.wording import by_number, format_percent
-from egvs.creation import junctions
+from egvs.core.wording import by_number, format_percent, number_of
+from egvs.creation import junctions, scenario_files
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.capacity import Capacity, distribute_total, find_capacity, scale_flows
+from egvs.traffic.movements import MovementNames
 
 JUNCTION_BLOCKER_S, TELEPORT_S = 10.0, 120.0
 """What ends locks in new scenarios; the second is longer than any red phase and most waits to give way."""
@@ -46,6 +52,8 @@ class AssumedTraffic:
     assumed: tuple[CountConfig, ...]
     capacity: Capacity
     level: str | None
+
+    is_recorded = False
 
     @cached_property
     def flows(self) -> tuple[CountConfig, ...]:
@@ -81,6 +89,81 @@ class AssumedTraffic:
         share = format_percent(TRAFFIC_LEVELS[self.level], 0)
         return f"carries {at_least}{self.carried_per_h:,} vehicles an hour; {self.level} {share} is used"
 
+    @property
+    def notes(self) -> list[str]:
+        """What the network does not carry."""
+        capacity = self.capacity
+        jam = f"; {capacity.jam}" if capacity.jam else ""
+        hint = "Lower per_hour of traffic.counts, or check the signals and connections there."
+        if self.level is None:
+            if capacity.is_everything:
+                return []
+            return [f"Traffic jams are likely: the network {self.summary}{jam}. {hint}"]
+        if not capacity.is_confirmed:
+            return [
+                "Traffic jams occur in"
+                f" {by_number(len(capacity.runs), 'the trial', f'all {len(capacity.runs)} trials')}{jam}. {hint}"
+            ]
+        if not capacity.is_everything:
+            return [f"The junction does not carry the {self.assumed_per_h:,} vehicles an hour of its road classes."]
+        return []
+
+    @property
+    def assumptions(self) -> list[str]:
+        """What is assumed, for the key ``assumed``."""
+        if self.level is None:
+            return [f"shares of the movements (of {self.per_h:,} vehicles an hour)"]
+        return [f"traffic ({self.per_h:,} vehicles an hour, from the road classes)"]
+
+    def describe(self) -> str:
+        """Return a sentence."""
+        movements = number_of(len(self.flows), "movement")
+        return f"the junction {self.summary}: {self.per_h:,} vehicles an hour in {movements} (assumed)"
+
+    def warnings(self, scenario_file: Path) -> Iterator[str]:
+        """Warn that the traffic is not counted."""
+        assumed = "the traffic is assumed" if self.level is not None else "the shares of the movements are assumed"
+        yield _assumed_warning(assumed, self.per_h, scenario_file)
+
+    def add_keys(self, table: Any, streets: Streets, junction: StreetJunction) -> None:
+        """Add the counts, and a template for periods, to ``[traffic]``."""
+        names = MovementNames(streets.network, junction.at_m, self.flows)
+        table.update({"counts": scenario_files.counts_array(self.flows, names)})
+        origin = f"assumed from the road classes ({self.assumed_per_h:,} vehicles an hour)"
+        if self.level is None:
+            origin = "divided among the movements by the road classes"
+        table["counts"].comment(f"{origin}; the network {self.summary}. Replace them by real counts")
+        for line in scenario_files.periods_template(self.flows[0]):
+            table.add(tomlkit.comment(line))
+
+
+class NoTraffic:
+    """The traffic of a region through which no street leads vehicles."""
+
+    flows: tuple[CountConfig, ...] = ()
+    notes: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()
+    is_recorded = False
+
+    def describe(self) -> str:
+        """Return a sentence."""
+        return "none: no street leads vehicles through the region"
+
+    def warnings(self, scenario_file: Path) -> Iterator[str]:
+        """Warn that there is no traffic."""
+        yield _assumed_warning("the traffic is assumed", 0, scenario_file)
+
+    def add_keys(self, table: Any, streets: Streets, junction: StreetJunction) -> None:
+        """Add nothing."""
+
+
+def _assumed_warning(assumed: str, per_h: int, scenario_file: Path) -> str:
+    return (
+        f"{assumed} ({per_h:,} vehicles an hour); this affects the ranking."
+        f" Enter counted traffic under [traffic] in {scenario_file} before you rely on the ranking,"
+        " and remove its entry from assumed."
+    )
+
 
 def check_traffic_level(level: str) -> None:
     """Raise an InputError unless a text is a key of :data:`TRAFFIC_LEVELS`."""
@@ -98,7 +181,7 @@ def check_traffic(traffic: str | int) -> None:
 
 def assume_traffic(
     network: str, streets: Streets, junction: StreetJunction, traffic: str | int
-) -> AssumedTraffic | None:
+) -> AssumedTraffic | NoTraffic:
     """Assume flows through the region of a junction, and find how much of them the network carries."""
     flows = junctions.assumed_flows(streets, junctions.region_around(junction), junction.ring)
     if isinstance(traffic, int):
@@ -107,26 +190,6 @@ def assume_traffic(
             raise InputError("--vehicles-per-hour", problem, "Choose another junction with --at LAT,LON.")
         flows = distribute_total(flows, traffic)
     if not flows:
-        return None
+        return NoTraffic()
     level = traffic if isinstance(traffic, str) else None
     return AssumedTraffic(tuple(flows), find_capacity(network, flows, JUNCTION_BLOCKER_S), level)
-
-
-def traffic_notes(traffic: AssumedTraffic | None) -> list[str]:
-    if traffic is None:
-        return []
-    capacity = traffic.capacity
-    jam = f"; {capacity.jam}" if capacity.jam else ""
-    hint = "Lower per_hour of traffic.counts, or check the signals and connections there."
-    if traffic.level is None:
-        if capacity.is_everything:
-            return []
-        return [f"Traffic jams are likely: the network {traffic.summary}{jam}. {hint}"]
-    if not capacity.is_confirmed:
-        return [
-            "Traffic jams occur in"
-            f" {by_number(len(capacity.runs), 'the trial', f'all {len(capacity.runs)} trials')}{jam}. {hint}"
-        ]
-    if not capacity.is_everything:
-        return [f"The junction does not carry the {traffic.assumed_per_h:,} vehicles an hour of its road classes."]
-    return []

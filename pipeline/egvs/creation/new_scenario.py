@@ -21,10 +21,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import tomlkit
@@ -38,12 +38,13 @@ from egvs.creation import (
     junction_zones,
     junctions,
     map_readers,
+    new_traffic,
     scenario_files,
     static_objects,
     street_counts,
 )
 from egvs.creation.alignment import PointPair, check_used, make_alignment
-from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
+from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, NoTraffic
 from egvs.creation.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
 from egvs.creation.junction_zones import Zone
 from egvs.creation.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
@@ -57,6 +58,7 @@ from egvs.creation.map_parts import (
     Terrain,
 )
 from egvs.creation.map_readers import MapFile, MapFiles
+from egvs.creation.new_traffic import NewTraffic, RecordingOptions, RecordingPlan, ScenarioTraffic
 from egvs.creation.openstreetmap import overpass
 from egvs.creation.openstreetmap import reader as openstreetmap
 from egvs.creation.openstreetmap.overpass import DownloadedExtract
@@ -75,29 +77,18 @@ from egvs.creation.scenario_files import (
     reachable_area,
 )
 from egvs.creation.static_objects import MapSummary, ReadMap, StaticObjects, SurfaceModel
-from egvs.creation.street_counts import StreetCounts
 from egvs.creation.terrain import bridge_decks, ground_heights, ground_reference
 from egvs.creation.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.creation.terrain.relief import Relief, ground_surface
-from egvs.extensions.tracks.new import demand as demand_from_tracks
-from egvs.extensions.tracks.new import files as recorded_traffic
-from egvs.extensions.tracks.new import signal_programs
-from egvs.extensions.tracks.new import signals as recorded_signals
-from egvs.extensions.tracks.new.demand import TrackDemand
-from egvs.extensions.tracks.new.files import TrackFiles
-from egvs.extensions.tracks.new.motion import MatchedRecording, match_recording
-from egvs.extensions.tracks.new.signal_assignment import RecordedMotion
-from egvs.extensions.tracks.new.signal_programs import RecordedSignalNetwork, Replay
-from egvs.extensions.tracks.recorded_tracks import RecordedTracks
 from egvs.formats import ply
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
 from egvs.sensors.sensor import CATALOGUE
-from egvs.traffic.movements import MovementNames
 from egvs.traffic.sumo import SumoInputError
 from egvs.world.static_world import build_world
+from egvs.world.terrain import TerrainSurface
 
 SURROUNDINGS_MIN_M = 100.0
 FAR_FROM_AT_M = 50.0
@@ -113,11 +104,59 @@ PEOPLE_HINT = (
     "Pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
 
-_SIGNALS_OF_TRACKS_NOTE = (
-    "Recorded traffic does not depend on the signals. They are tested against it, and network.net.xml replays them on"
-    " its clock; with --like instead of --tracks, simulated traffic obeys them."
-)
 _NO_SIGNALS_NOTE = "No junction in the map has signals; the one with the most incoming lanes was chosen."
+
+
+@dataclass(frozen=True)
+class NewRegion:
+    """The junction of a new scenario, and the region of interest around it.
+
+    Attributes
+    ----------
+    junction, roi
+        The junction, and the region around it.
+    height_m
+        Height of the region.
+    zones
+        Its zones, for which results are reported.
+    from_at_m
+        Distance of the junction from the requested position, 0 inside it; None without such a position.
+    """
+
+    junction: StreetJunction
+    roi: JunctionRegion
+    height_m: float
+    zones: tuple[Zone, ...]
+    from_at_m: float | None
+
+    @property
+    def is_far_from_at(self) -> bool:
+        """Whether the junction may be another one than the user meant."""
+        return self.from_at_m is not None and self.from_at_m > FAR_FROM_AT_M
+
+
+@dataclass(frozen=True)
+class NewStatics:
+    """The static objects of a new scenario.
+
+    Attributes
+    ----------
+    counts
+        What happened to the objects of the maps.
+    maps
+        What each map with static objects contributed.
+    n_solids
+        Number of solids of the static world, the ground included. A tree is two, an object that is cut may be several.
+    """
+
+    counts: ImportCounts
+    maps: tuple[MapSummary, ...]
+    n_solids: int
+
+    @property
+    def maps_have_notes(self) -> bool:
+        """Whether there is something to know about single maps."""
+        return any(summary.notes for summary in self.maps)
 
 
 @dataclass(frozen=True, repr=False)
@@ -128,81 +167,45 @@ class NewScenario:
     ----------
     folder
         The scenario's folder.
-    junction, roi
+    region
         The junction, and the region of interest around it.
     streets
         The simulated streets.
+    statics
+        The static objects.
     poles
         Number of locations for poles.
-    statics
-        What happened to the objects of the map.
-    n_solids
-        Number of solids of the static world, the ground included. A tree is two, an object that is cut may be several.
     traffic
-        The traffic through the region of interest; None where no street leads through it.
+        The vehicles: assumed, counted, or from recorded tracks.
     notes
         What to know before trusting the scenario.
-    height_m
-        Height of the region of interest.
-    maps
-        What each map with static objects contributed.
     attributions
         Who made the maps.
-    from_at_m
-        Distance of the junction from the requested position, 0 inside it; None without such a position.
-    recorded
-        The recorded traffic, if there is one.
-    demand
-        The demand that was estimated from recorded tracks, if there are such tracks.
-    signal_notes
-        Durations of recorded signals, with intervals; empty without them.
-    counted
-        The user's counts, if there are any.
-    zones
-        Zones of the junction, for which results are reported.
-    are_lights_guessed
-        Whether it was guessed which recorded light governs which road.
     """
 
     folder: Path
-    junction: StreetJunction
-    roi: JunctionRegion
+    region: NewRegion
     streets: Streets
+    statics: NewStatics
     poles: int
-    statics: ImportCounts
-    n_solids: int
-    traffic: AssumedTraffic | None
+    traffic: ScenarioTraffic
     notes: tuple[str, ...]
-    height_m: float = junctions.ROI_HEIGHT_M
-    maps: tuple[MapSummary, ...] = ()
-    attributions: tuple[str, ...] = ()
-    from_at_m: float | None = None
-    recorded: RecordedTracks | None = None
-    demand: TrackDemand | None = None
-    signal_notes: tuple[str, ...] = ()
-    counted: StreetCounts | None = None
-    zones: tuple[Zone, ...] = ()
-    are_lights_guessed: bool = False
+    attributions: tuple[str, ...]
 
     def __repr__(self) -> str:
         vehicles_per_hour = sum(flow.per_hour for flow in self.flows)
         parts = (
             f"{self.junction.title}, {self.junction.arms} arms",
             f"{self.n_candidates} candidate sites on {self.poles} poles",
-            f"{self.n_solids} solids",
+            f"{self.statics.n_solids} solids",
             f"{vehicles_per_hour:,.0f} vehicles an hour",
         )
         return f"NewScenario({self.folder.name}: {'; '.join(parts)})"
 
     @property
-    def maps_have_notes(self) -> bool:
-        """Whether there is something to know about single maps."""
-        return any(summary.notes for summary in self.maps)
-
-    @property
-    def is_far_from_at(self) -> bool:
-        """Whether the junction may be another one than the user meant."""
-        return self.from_at_m is not None and self.from_at_m > FAR_FROM_AT_M
+    def junction(self) -> StreetJunction:
+        """The junction."""
+        return self.region.junction
 
     @property
     def n_candidates(self) -> int:
@@ -211,12 +214,8 @@ class NewScenario:
 
     @property
     def flows(self) -> tuple[CountConfig, ...]:
-        """The flows of the scenario; empty where no street leads through the region of interest."""
-        if self.demand is not None:
-            return self.demand.flows
-        if self.counted is not None:
-            return self.counted.flows
-        return () if self.traffic is None else self.traffic.flows
+        """The flows that are simulated."""
+        return self.traffic.flows
 
 
 @dataclass(frozen=True)
@@ -246,7 +245,7 @@ class NewScenarioOptions:
     pedestrian_tracks
         The same, of people on foot and on bicycles, who are put beside simulated vehicles.
     signals
-        Files of recorded signals of the junction, and of what their groups govern; see :mod:`recorded_signals`.
+        Files of recorded signals of the junction, and of what their groups govern.
     track_crs
         Coordinate system of the tracks, as for the key ``traffic.track_crs``.
     track_columns
@@ -272,9 +271,17 @@ class NewScenarioOptions:
     surface: tuple[Path, ...] = ()
     counts: Path | None = None
 
+    @property
+    def recordings(self) -> RecordingOptions:
+        """The options that an extension reads."""
+        return RecordingOptions(
+            self.tracks, self.like, self.pedestrian_tracks, self.signals, self.track_crs, self.track_columns
+        )
+
     def check(self) -> None:
-        """Raise an InputError when a value is out of its limits."""
+        """Raise an InputError when a value is out of its limits, or no installed extension reads recordings."""
         assumed_traffic.check_traffic(self.traffic)
+        self.recordings.check()
         _check_pole_spacing(self.pole_spacing_m)
         if self.tracks and self.like:
             hint = "--tracks replays tracks, --like simulates such traffic."
@@ -295,6 +302,77 @@ class NewScenarioOptions:
                 f"expected at least {SURROUNDINGS_MIN_M:g} m, got {self.surroundings_m:g} m",
                 "Choose a distance that includes the junction and its approaches.",
             )
+
+
+@dataclass
+class _Draft:
+    """A new scenario while the steps of :func:`create_scenario` complete it.
+
+    Attributes
+    ----------
+    folder, name
+        The scenario's folder, and its name.
+    at, options
+        As for :func:`create_scenario`.
+    files, surface_files
+        The opened maps, and rasters of the heights of roofs and trees.
+    map_roads, recordings
+        All roads of the map, and the recordings of its traffic.
+    level, roads
+        The roads on the level of the junction; those that the scenario keeps, on the ground.
+    junction, window, context
+        The junction, the area within sensor range of its region, and how maps are read there.
+    maps, surface
+        The static objects of each map, and the heights of roofs and trees.
+    terrain, terrain_m, zero, ground
+        Heights of the ground: as read, as points (n, 3) in the world frame, the height of z = 0, and as a surface.
+    objects
+        The static objects.
+    roi, relief, zones, poles
+        The region of interest, its relief, its zones, and the locations for poles.
+    plan, traffic
+        What the recordings give to the scenario, and its vehicles.
+    notes
+        What to know before trusting the scenario.
+    """
+
+    folder: Path
+    name: str
+    at: tuple[float, float] | None
+    options: NewScenarioOptions
+    files: MapFiles
+    surface_files: tuple[MapFile, ...]
+    map_roads: RoadSource = field(init=False)
+    recordings: NewTraffic | None = field(init=False)
+    level: RoadSource = field(init=False)
+    roads: RoadSource = field(init=False)
+    junction: StreetJunction = field(init=False)
+    window: BaseGeometry = field(init=False)
+    context: MapContext = field(init=False)
+    maps: Sequence[ReadMap] = field(init=False)
+    surface: Terrain | None = field(init=False)
+    terrain: Terrain | None = field(init=False)
+    terrain_m: FloatArray | None = field(init=False)
+    zero: ground_reference.ZeroHeight = field(init=False)
+    ground: TerrainSurface | None = field(init=False)
+    objects: StaticObjects = field(init=False)
+    roi: JunctionRegion = field(init=False)
+    relief: Relief = field(init=False)
+    zones: tuple[Zone, ...] = field(init=False)
+    poles: Sequence[KerbsidePole] = field(init=False)
+    plan: RecordingPlan = field(init=False)
+    traffic: ScenarioTraffic = field(init=False)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def has_tracks(self) -> bool:
+        """Whether recorded tracks show where the junction is."""
+        return self.recordings is not None and self.recordings.path is not None
+
+    @property
+    def attributions(self) -> tuple[str, ...]:
+        """Who made the maps."""
+        return _attributions(self.roads, self.objects)
 
 
 def create_scenario(
@@ -329,125 +407,208 @@ def create_scenario(
         ``at`` is outside or far from any junction, no site is possible, or an option has no effect. Nothing is written
         then.
     """
-    options = options or NewScenarioOptions()
+    draft = _open_files(Path(folder), maps, at, options or NewScenarioOptions())
+    _read_roads_and_recordings(draft)
+    _choose_surroundings(draft)
+    _read_maps(draft)
+    _lay_on_ground(draft)
+    _collect_objects(draft)
+    _choose_region(draft)
+    _choose_poles(draft)
+    _note_doubts(draft)
+    _plan_traffic(draft)
+    return _write_scenario(draft)
+
+
+def _open_files(
+    folder: Path, maps: str | Path | Sequence[str | Path], at: tuple[float, float] | None, options: NewScenarioOptions
+) -> _Draft:
+    """Check the options and the folder, and open the maps."""
     options.check()
-    folder = Path(folder)
     name = scenario_files.check_new_folder(folder)
     map_paths = [maps] if isinstance(maps, str | Path) else maps
     files = map_readers.open_maps([Path(path) for path in map_paths])
-    surface_files = map_readers.open_surface(options.surface)
-    roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
-    recording, example, people = (
-        _find_tracks(paths, options) for paths in (options.tracks, options.like, options.pedestrian_tracks)
-    )
-    any_tracks = recording or example or people
-    junction = _choose_junction(roads.streets, at, any_tracks, files.roads.path)
+    return _Draft(folder, name, at, options, files, map_readers.open_surface(options.surface))
 
-    level = roads.on_level_of(junction)
-    if level.streets is not roads.streets:
-        junction = _find_again(level.streets, junction, roads.streets, files.roads.path)
-    window = reachable_area(junctions.region_around(junction))
+
+def _read_roads_and_recordings(draft: _Draft) -> None:
+    """Read all roads of the map, and find the reader of each recording."""
+    options = RoadOptions(draft.options.lefthand, draft.options.walk, has_terrain=bool(draft.files.terrain))
+    draft.map_roads = _read_roads(draft.files.roads, options, draft.at)
+    draft.recordings = new_traffic.find_recordings(draft.options.recordings)
+
+
+def _choose_surroundings(draft: _Draft) -> None:
+    """Choose the junction, the roads on its level, and the area within sensor range."""
+    path = draft.files.roads.path
+    junction = _choose_junction(draft.map_roads.streets, draft.at, draft.recordings, path)
+    level = draft.map_roads.on_level_of(junction)
+    if level.streets is not draft.map_roads.streets:
+        junction = _find_again(level.streets, junction, draft.map_roads.streets, path)
+
     frame = level.streets.frame
-    alignment = make_alignment(options.align, frame) if options.align else None
-    context = MapContext(frame, window, alignment, level.streets)
-    roads = level.around(junction, options.surroundings_m)
-    maps_read = static_objects.read_maps(files.solids, level, files.roads, context)
-    terrain = ground_reference.read_terrain(files.terrain, ground_reference.with_roads(context, roads.streets))
-    measured = static_objects.ground_mesh(maps_read)
-    surface = ground_reference.read_terrain(surface_files, context)
+    alignment = make_alignment(draft.options.align, frame) if draft.options.align else None
+    draft.junction, draft.level = junction, level
+    draft.window = reachable_area(junctions.region_around(junction))
+    draft.context = MapContext(frame, draft.window, alignment, level.streets)
+    draft.roads = level.around(junction, draft.options.surroundings_m)
+
+
+def _read_maps(draft: _Draft) -> None:
+    """Read static objects, the ground, and the heights of roofs and trees within sensor range."""
+    files, context = draft.files, draft.context
+    draft.maps = static_objects.read_maps(files.solids, draft.level, files.roads, context)
+    draft.terrain = ground_reference.read_terrain(
+        files.terrain, ground_reference.with_roads(context, draft.roads.streets)
+    )
+    draft.surface = ground_reference.read_terrain(draft.surface_files, context)
     check_used(context)
+
+
+def _lay_on_ground(draft: _Draft) -> None:
+    """Find the ground and the height of z = 0, and lay the roads on the ground."""
+    measured = static_objects.ground_mesh(draft.maps)
     ground_notes = []
-    if terrain is None and measured is not None:
-        terrain = ground_reference.measured_ground(measured)
+    if draft.terrain is None and measured is not None:
+        draft.terrain = ground_reference.measured_ground(measured)
     elif measured is not None:
         ground_notes.append("The ground of the point cloud is not used, since a terrain file is given.")
-    zero = ground_reference.find_zero(roads, files.roads, junction, terrain, files.terrain)
-    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain, files.terrain)
-    terrain_m = None if terrain is None else _terrain_points(terrain, window, zero.height_m or 0.0)
-    ground = ground_surface(roads.streets, terrain_m)
-    objects = static_objects.collect_objects(
-        maps_read, level.streets, junction.at_m, zero.height_m, ground, _surface_model(surface, terrain)
-    )
-    _check_zero_height(objects.zero_height_m, files)
-    if files.terrain and terrain is not None and zero.height_m is not None:
-        decks = bridge_decks.bridge_decks(roads.network, terrain, zero.height_m)
-        objects = replace(objects, meshes=(*objects.meshes, *decks))
-    if roads.streets is not level.streets:
-        junction = _require_junction(junctions.find_again(roads.streets, junction, junction.at_m), files.roads.path)
-    streets = roads.streets
-    roi = junctions.region_around(junction)
-    poles = junctions.kerbside_poles(streets, junction, roi, objects.areas, options.pole_spacing_m)
-    if not poles:
-        has_free_poles = bool(junctions.kerbside_poles(streets, junction, roi, [], options.pole_spacing_m))
-        covering = objects.file_names if has_free_poles else ()
-        raise _no_pole_error(junction, options, files.roads.path, covering)
+    terrain, files = draft.terrain, draft.files
+    draft.zero = ground_reference.find_zero(draft.roads, files.roads, draft.junction, terrain, files.terrain)
+    draft.roads = ground_reference.lay_on_ground(draft.roads, files.roads, draft.junction, terrain, files.terrain)
+    draft.terrain_m = None
+    if terrain is not None:
+        draft.terrain_m = _terrain_points(terrain, draft.window, draft.zero.height_m or 0.0)
+    draft.ground = ground_surface(draft.roads.streets, draft.terrain_m)
+    draft.notes += [*draft.roads.notes, *draft.zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
 
-    notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
-    notes += _surface_notes(surface, objects.counts)
-    if at is None and any_tracks is None and not junction.signalised:
-        notes.append(_NO_SIGNALS_NOTE)
-    notes += _ring_notes(streets, junction)
-    notes += scenario_notes(roi.area.covers(junction.area), objects.counts)
-    notes += _level_notes(level, objects.counts) + _range_notes(objects.counts)
-    if options.walk:
-        notes.append(PEOPLE_HINT)
-    matched = [match_recording(tracks, streets) for tracks in (recording, example, people) if tracks is not None]
-    signals = RecordedSignalNetwork(roads.network, ())
-    if options.signals:
-        replay = None
-        if recording is not None:
-            replay = Replay.of(recording.time_range_s, begin_s=0.0)
-        elif people is not None:
-            replay = Replay.of(people.time_range_s, begin_s=DEFAULT_WARMUP_S)
-        signals = _with_signals(roads.network, junction, options.signals, streets, matched, replay)
-        junction = replace(junction, signalised=True)
-        notes += [] if recording is None else [_SIGNALS_OF_TRACKS_NOTE]
-    like = None if example is None else matched[0]
-    planned = _plan_traffic(signals.network, streets, junction, options, like, files.roads.path)
-    notes += [*signals.notes, *planned.notes]
-    relief = Relief.of_region(streets, junction, roi)
-    if relief.other_levels:
-        notes.append(f"Lanes on another level cross the region of interest: {', '.join(relief.other_levels)}.")
 
-    scenario = NewScenario(
-        folder, junction, roi, streets, len(poles), objects.counts, 0, planned.assumed, tuple(notes),
-        height_m=relief.z_range_m[1] - relief.z_range_m[0], maps=objects.maps,
-        attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
-        demand=planned.demand, signal_notes=signals.notes, counted=planned.counted,
-        zones=junction_zones.junction_zones(streets, junction, roi), are_lights_guessed=signals.is_guessed,
+def _collect_objects(draft: _Draft) -> None:
+    """Collect the static objects of all maps, and the decks of bridges."""
+    terrain, zero_height_m = draft.terrain, draft.zero.height_m
+    draft.objects = static_objects.collect_objects(
+        draft.maps, draft.level.streets, draft.junction.at_m, zero_height_m, draft.ground,
+        _surface_model(draft.surface, terrain),
     )  # fmt: skip
-    ground_m = relief.ground_m(ground, poles)
-    columns = _site_columns(poles, ground_m, relief, maps_read, roi, zero.height_m or 0.0)
-    meshes = static_objects.mesh_files([mesh for mesh in objects.meshes if mesh.kind != static_objects.GROUND])
+    _check_zero_height(draft.objects.zero_height_m, draft.files)
+    if draft.files.terrain and terrain is not None and zero_height_m is not None:
+        decks = bridge_decks.bridge_decks(draft.roads.network, terrain, zero_height_m)
+        draft.objects = replace(draft.objects, meshes=(*draft.objects.meshes, *decks))
+
+
+def _choose_region(draft: _Draft) -> None:
+    """Put the region of interest around the junction, in the streets that the scenario keeps."""
+    streets = draft.roads.streets
+    if streets is not draft.level.streets:
+        found = junctions.find_again(streets, draft.junction, draft.junction.at_m)
+        draft.junction = _require_junction(found, draft.files.roads.path)
+    draft.roi = junctions.region_around(draft.junction)
+    draft.relief = Relief.of_region(streets, draft.junction, draft.roi)
+    draft.zones = junction_zones.junction_zones(streets, draft.junction, draft.roi)
+
+
+def _choose_poles(draft: _Draft) -> None:
+    """Choose locations for poles along the kerbs; InputError where there is none."""
+    streets, spacing_m = draft.roads.streets, draft.options.pole_spacing_m
+    draft.poles = junctions.kerbside_poles(streets, draft.junction, draft.roi, draft.objects.areas, spacing_m)
+    if not draft.poles:
+        has_free_poles = bool(junctions.kerbside_poles(streets, draft.junction, draft.roi, [], spacing_m))
+        covering = draft.objects.file_names if has_free_poles else ()
+        raise _no_pole_error(draft.junction, draft.options, draft.files.roads.path, covering)
+
+
+def _note_doubts(draft: _Draft) -> None:
+    """Note what to know about the junction and its static objects before trusting the scenario."""
+    counts, junction = draft.objects.counts, draft.junction
+    draft.notes += _surface_notes(draft.surface, counts)
+    if draft.at is None and not draft.has_tracks and not junction.signalised:
+        draft.notes.append(_NO_SIGNALS_NOTE)
+    draft.notes += _ring_notes(draft.roads.streets, junction)
+    draft.notes += scenario_notes(draft.roi.area.covers(junction.area), counts)
+    draft.notes += _level_notes(draft.level, counts) + _range_notes(counts)
+    if draft.options.walk:
+        draft.notes.append(PEOPLE_HINT)
+
+
+def _plan_traffic(draft: _Draft) -> None:
+    """Plan recorded signals and vehicles; where vehicles are not recorded, count or assume them."""
+    streets = draft.roads.streets
+    draft.plan = RecordingPlan(draft.roads.network)
+    if draft.recordings is not None:
+        draft.plan = draft.recordings.plan(draft.roads.network, streets, draft.junction)
+    if draft.options.signals:
+        draft.junction = replace(draft.junction, signalised=True)
+    draft.traffic = _choose_vehicles(draft)
+    draft.notes += [*draft.plan.notes, *draft.traffic.notes]
+    if draft.relief.other_levels:
+        titles = ", ".join(draft.relief.other_levels)
+        draft.notes.append(f"Lanes on another level cross the region of interest: {titles}.")
+
+
+def _choose_vehicles(draft: _Draft) -> ScenarioTraffic:
+    """Return recorded vehicles, or else the user's counts, or else assumed ones."""
+    options, streets = draft.options, draft.roads.streets
+    if draft.plan.traffic is not None:
+        return draft.plan.traffic
+    if draft.plan.is_finished:
+        return NoTraffic()  # none is simulated; the recorded ones are read back from the finished scenario
+    if options.counts is not None:
+        return street_counts.read_junction_counts(options.counts, streets, draft.junction)
+    try:
+        return assumed_traffic.assume_traffic(draft.plan.network, streets, draft.junction, options.traffic)
+    except SumoInputError as error:
+        lines = " ".join(line.strip() for line in str(error).splitlines()).rstrip(":.")
+        hint = "Check the map, e.g. its traffic lights and connections in netedit."
+        raise InputError(draft.files.roads.path, f"SUMO cannot simulate the network ({lines})", hint) from None
+
+
+def _write_scenario(draft: _Draft) -> NewScenario:
+    """Write all files, and check that the finished folder can be read."""
+    zero_height_m = draft.zero.height_m or 0.0
+    ground_m = draft.relief.ground_m(draft.ground, draft.poles)
+    columns = _site_columns(draft.poles, ground_m, draft.relief, draft.maps, draft.roi, zero_height_m)
+    solid_meshes = [mesh for mesh in draft.objects.meshes if mesh.kind != static_objects.GROUND]
+    meshes = static_objects.mesh_files(solid_meshes)
     terrain_files = {}
-    if terrain_m is not None:
-        terrain_files[TERRAIN_FILE] = partial(ply.write, points_m=terrain_m)
+    if draft.terrain_m is not None:
+        terrain_files[TERRAIN_FILE] = partial(ply.write, points_m=draft.terrain_m)
     statics = scenario_files.statics_table(list(meshes), *terrain_files)
-    signals_end_s = None if signals.clock is None else signals.clock.to_s
-    document = _scenario_toml(
-        name, scenario, relief, statics, objects.zero_height_m, recording, people, signals_end_s
-    )  # fmt: skip
     contents: dict[str, FileContent] = {
-        NETWORK_FILE: signals.network,
-        STATICS_FILE: scenario_files.solids_geojson(objects.solids, objects.counts, scenario.attributions),
-        SITES_FILE: scenario_files.sites_csv(poles, columns),
-        **({ZONES_FILE: junction_zones.zones_geojson(scenario.zones)} if scenario.zones else {}),
+        NETWORK_FILE: draft.plan.network,
+        STATICS_FILE: scenario_files.solids_geojson(draft.objects.solids, draft.objects.counts, draft.attributions),
+        SITES_FILE: scenario_files.sites_csv(draft.poles, columns),
+        **({ZONES_FILE: junction_zones.zones_geojson(draft.zones)} if draft.zones else {}),
         **meshes,
         **terrain_files,
-        **({} if recording is None else recording.copies()),
-        **({} if people is None else people.copies()),
-        SCENARIO_FILE: document,
+        **draft.plan.files,
+        SCENARIO_FILE: _scenario_toml(draft, statics),
     }
-    checked: list[NewScenario] = []
+    created: list[NewScenario] = []
 
     def check(partial_folder: Path) -> None:
         loaded = load(partial_folder)
         world, _ = build_world(loaded)
-        recorded = None if recording is None else recorded_traffic.read_for_summary(loaded)
-        checked.append(replace(scenario, n_solids=len(world.solids), recorded=recorded))
+        traffic = draft.traffic if draft.plan.read_back is None else draft.plan.read_back(loaded)
+        created.append(_summarise(draft, traffic, len(world.solids)))
 
-    scenario_files.publish_folder(folder, contents.items(), check)
-    return checked[0]
+    scenario_files.publish_folder(draft.folder, contents.items(), check)
+    return created[0]
+
+
+def _summarise(draft: _Draft, traffic: ScenarioTraffic, n_solids: int) -> NewScenario:
+    """Return what was made."""
+    low_m, high_m = draft.relief.z_range_m
+    from_at_m = _distance_m(draft.roads.streets, draft.junction, draft.at)
+    return NewScenario(
+        draft.folder,
+        NewRegion(draft.junction, draft.roi, high_m - low_m, draft.zones, from_at_m),
+        draft.roads.streets,
+        NewStatics(draft.objects.counts, draft.objects.maps, n_solids),
+        len(draft.poles),
+        traffic,
+        tuple(draft.notes),
+        draft.attributions,
+    )
 
 
 def download_map(
@@ -476,49 +637,6 @@ def download_map(
     options.check()
     scenario_files.check_new_folder(folder)
     return overpass.download_extract(at, options.surroundings_m, url)
-
-
-def _with_signals(
-    network: str, junction: StreetJunction, paths: Sequence[Path], streets: Streets,
-    matched: Sequence[MatchedRecording], replay: Replay | None,
-) -> RecordedSignalNetwork:  # fmt: skip
-    """Return the network with recorded signals at the junction, and notes on them."""
-    if junction.ring is not None:
-        raise InputError("--signals", "the junction is a roundabout", "Choose another junction with --at LAT,LON.")
-    signals = recorded_signals.read_signals(paths)
-    where = ", ".join(map(str, paths))
-    motion = RecordedMotion.joined([each.motion() for each in matched])
-    return signal_programs.apply_signals(network, junction.id, signals, streets.frame, where, motion, replay)
-
-
-class _PlannedTraffic(NamedTuple):
-    """The assumed traffic, the demand like recorded tracks, or the counts; neither for recorded traffic. And notes."""
-
-    notes: Sequence[str] = ()
-    assumed: AssumedTraffic | None = None
-    demand: TrackDemand | None = None
-    counted: StreetCounts | None = None
-
-
-def _plan_traffic(
-    network: str, streets: Streets, junction: StreetJunction, options: NewScenarioOptions,
-    example: MatchedRecording | None, path: Path,
-) -> _PlannedTraffic:  # fmt: skip
-    if example is not None:
-        demand = demand_from_tracks.estimate_demand(example, streets, junction)
-        return _PlannedTraffic(demand.notes, demand=demand)
-    if options.counts is not None:
-        counted = street_counts.read_junction_counts(options.counts, streets, junction)
-        return _PlannedTraffic(counted.notes, counted=counted)
-    if options.tracks:
-        return _PlannedTraffic()
-    try:
-        assumed = assumed_traffic.assume_traffic(network, streets, junction, options.traffic)
-    except SumoInputError as error:
-        lines = " ".join(line.strip() for line in str(error).splitlines()).rstrip(":.")
-        hint = "Check the map, e.g. its traffic lights and connections in netedit."
-        raise InputError(path, f"SUMO cannot simulate the network ({lines})", hint) from None
-    return _PlannedTraffic(assumed_traffic.traffic_notes(assumed), assumed)
 
 
 def _check_zero_height(height_m: float | None, maps: MapFiles) -> None:
@@ -583,22 +701,12 @@ def _read_roads(file: MapFile, options: RoadOptions, at: tuple[float, float] | N
     return NetworkRoads.read(file.reader.read_roads(file.path, options), file.path)
 
 
-def _find_tracks(paths: Sequence[Path], options: NewScenarioOptions) -> TrackFiles | None:
-    """Return recorded tracks, if there are any."""
-    if not paths:
-        return None
-    columns = None
-    if options.track_columns is not None:
-        columns = recorded_traffic.read_track_columns(options.track_columns)
-    return TrackFiles.find(paths, options.track_crs, columns)
-
-
 def _choose_junction(
-    streets: Streets, at: tuple[float, float] | None, recording: TrackFiles | None, path: Path
+    streets: Streets, at: tuple[float, float] | None, recordings: NewTraffic | None, path: Path
 ) -> StreetJunction:
-    """Return the junction at the requested position, or else that of the recording, or else the largest one."""
-    if at is None and recording is not None:
-        return _junction_at(streets, recording.middle_m(streets), str(recording.source.paths[0]))
+    """Return the junction at the requested position, or else that of recorded tracks, or else the largest one."""
+    if at is None and recordings is not None and recordings.path is not None:
+        return _junction_at(streets, recordings.middle_m(streets), str(recordings.path))
     if at is None:
         return _require_junction(junctions.largest_junction(streets), path)
     return _junction_at(streets, _to_world(streets, at), "--at")
@@ -736,20 +844,18 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
     return notes
 
 
-def _scenario_toml(
-    name: str, scenario: NewScenario, relief: Relief, statics: TomlTable, zero_height_m: float | None,
-    recording: TrackFiles | None, people: TrackFiles | None, signals_end_s: float | None,
-) -> str:  # fmt: skip
-    title = scenario.junction.title
+def _scenario_toml(draft: _Draft, statics: TomlTable) -> str:
+    """Return the text of ``scenario.toml``."""
+    title = draft.junction.title
     values: dict[str, Any] = {
         "description": title[0].upper() + title[1:],
-        "assumed": _assumptions(scenario, is_recorded=recording is not None or bool(scenario.signal_notes)),
+        "assumed": _assumptions(draft),
         "seed": 1,
     }
-    if name:
-        values = {"name": name} | values
+    if draft.name:
+        values = {"name": draft.name} | values
 
-    roi_comment, roi = scenario_files.roi_table(scenario.roi, relief.z_range_m)
+    roi_comment, roi = scenario_files.roi_table(draft.roi, draft.relief.z_range_m)
     sites_comment, sites = scenario_files.sites_table()
     traffic = {
         "network": NETWORK_FILE,
@@ -759,76 +865,28 @@ def _scenario_toml(
         "junction_blocker_s": JUNCTION_BLOCKER_S,
         "teleport_s": TELEPORT_S,
     }
-    if people is not None:
-        traffic |= people.pedestrian_table(signals_end_s)
-    if recording is not None:
-        traffic = recording.traffic_table()
+    traffic = dict(draft.plan.keys) if draft.plan.is_finished else traffic | draft.plan.keys
     tables = {
         "roi": (roi_comment, roi | scenario_files.voxel_keys()),
-        "traffic": ("SUMO" if recording is None else "recorded; nothing is simulated", traffic),
+        "traffic": ("recorded; nothing is simulated" if draft.plan.is_finished else "SUMO", traffic),
         "statics": statics,
         "sites": (sites_comment, sites | scenario_files.mount_keys()),
-        "score": scenario_files.score_table(ZONES_FILE if scenario.zones else None),
+        "score": scenario_files.score_table(ZONES_FILE if draft.zones else None),
         "placement": scenario_files.placement_table(),
     }
-    if zero_height_m:
-        zero = {"zero_height_m": round(zero_height_m, 3)}
+    if draft.objects.zero_height_m:
+        zero = {"zero_height_m": round(draft.objects.zero_height_m, 3)}
         tables["crs"] = ("height of z = 0 above sea level, for measured scans that state their reference system", zero)
-    ground = "flat ground" if relief.is_flat else "zero height of the network"
+    ground = "flat ground" if draft.relief.is_flat else "zero height of the network"
     comments = [
-        *_origin_comments(scenario.attributions),
+        *_origin_comments(draft.attributions),
         f"World frame: x east, y north in metres as in {NETWORK_FILE}, z up from the {ground}.",
     ]
     document = scenario_files.toml_document(comments, values, tables)
-    for note in scenario.signal_notes:
+    for note in draft.plan.signal_notes:
         document["traffic"].add(tomlkit.comment(f"{NETWORK_FILE}: {note}"))
-    flows = scenario.flows
-    if scenario.counted is not None:
-        flows = tuple(flow for hour in scenario.counted.hours for flow in hour.flows)
-    names = MovementNames(scenario.streets.network, scenario.junction.at_m, flows)
-    if scenario.demand is not None:
-        _add_demand(document["traffic"], scenario.demand, names)
-    if scenario.counted is not None:
-        _add_counts(document["traffic"], scenario.counted, names)
-    if scenario.traffic is not None:
-        document["traffic"].update({"counts": scenario_files.counts_array(scenario.traffic.flows, names)})
-        origin = f"assumed from the road classes ({scenario.traffic.assumed_per_h:,} vehicles an hour)"
-        if scenario.traffic.level is None:
-            origin = "divided among the movements by the road classes"
-        comment = f"{origin}; the network {scenario.traffic.summary}. Replace them by real counts"
-        document["traffic"]["counts"].comment(comment)
-        for line in scenario_files.periods_template(scenario.traffic.flows[0]):
-            document["traffic"].add(tomlkit.comment(line))
+    draft.traffic.add_keys(document["traffic"], draft.roads.streets, draft.junction)
     return tomlkit.dumps(document)
-
-
-def _add_counts(table: Any, counted: StreetCounts, names: MovementNames) -> None:
-    """Add the user's counts to ``[traffic]``; several hours become periods."""
-    origin = f"vehicles an hour, from {counted.path.name}"
-    if len(counted.hours) == 1:
-        table.update({"counts": scenario_files.counts_array(counted.hours[0].flows, names)})
-        table["counts"].comment(origin)
-        return
-    table.add(tomlkit.comment(f"{origin}; one period for each hour"))
-    periods = tomlkit.aot()
-    for hour in counted.hours:
-        period = tomlkit.table()
-        period.update({"name": hour.name, "weight": 1, "counts": scenario_files.counts_array(hour.flows, names)})
-        periods.append(period)
-    table.add("periods", periods)
-
-
-def _add_demand(table: Any, demand: TrackDemand, names: MovementNames) -> None:
-    """Add the demand that was estimated from recorded tracks to ``[traffic]``."""
-    kinds = [estimate.kind for estimate in demand.fleet]
-    table.update({"kinds": scenario_files.kinds_array(kinds, [estimate.comments for estimate in demand.fleet])})
-    table["kinds"].comment("estimated from the recorded vehicles")
-    comments = [movement.comment for movement in demand.movements]
-    table.update({"counts": scenario_files.counts_array(demand.flows, names, comments)})
-    table["counts"].comment(f"vehicles an hour, from {demand.duration_s:,.0f} s of recorded tracks")
-    table.add(tomlkit.comment("The profile of the day is not extrapolated from the recording; it is yours to enter."))
-    for line in scenario_files.periods_template(max(demand.flows, key=lambda flow: flow.per_hour)):
-        table.add(tomlkit.comment(line))
 
 
 def _origin_comments(attributions: Sequence[str]) -> list[str]:
@@ -840,23 +898,12 @@ def _origin_comments(attributions: Sequence[str]) -> list[str]:
     return [f"A scenario made from maps. Map data: {'; '.join(attributions)}."]
 
 
-def _assumptions(scenario: NewScenario, *, is_recorded: bool) -> list[str]:
+def _assumptions(draft: _Draft) -> list[str]:
     """Return what the map does not tell, for the key ``assumed``."""
-    assumed = []
-    traffic = scenario.traffic
-    if traffic is not None and traffic.level is None:
-        assumed.append(f"shares of the movements (of {traffic.per_h:,} vehicles an hour)")
-    elif traffic is not None:
-        assumed.append(f"traffic ({traffic.per_h:,} vehicles an hour, from the road classes)")
-    if scenario.demand is not None:
-        assumed += scenario.demand.assumptions
-    if scenario.counted is not None:
-        assumed += scenario.counted.assumptions
-    if scenario.junction.signalised and not is_recorded:
+    assumed = list(draft.traffic.assumptions)
+    if draft.junction.signalised and not draft.plan.is_finished and not draft.plan.signal_notes:
         assumed.append(ASSUMED_PLANS)
-    if scenario.are_lights_guessed:
-        assumed.append("which recorded light governs which road")
-    return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]
+    return [*assumed, *draft.plan.assumptions, *assumed_sizes(draft.objects.counts), "positions of the poles"]
 
 
 def _assumed_buildings(heights: Counter[str]) -> int:

@@ -24,10 +24,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import tomlkit
 
 from egvs.core.errors import InputError, find_misspelling
 from egvs.core.wording import list_first, number_of
-from egvs.creation import junctions
+from egvs.creation import junctions, scenario_files
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.formats import csv_tables
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
@@ -96,6 +99,8 @@ class StreetCounts:
     notes: tuple[str, ...]
     split: tuple[str, ...]
 
+    is_recorded = False
+
     @property
     def flows(self) -> tuple[CountConfig, ...]:
         """The flows of the busiest hour."""
@@ -118,6 +123,27 @@ class StreetCounts:
             return f"{number_of(self.hours[0].per_h, 'vehicle')} an hour {counted}"
         amounts = [f"{hour.name} {hour.per_h:,}" for hour in self.hours]
         return f"vehicles an hour {counted}: {', '.join(amounts)}"
+
+    def warnings(self, _scenario_file: Path) -> Iterator[str]:
+        """Yield nothing: notes say what is assumed."""
+        yield from ()
+
+    def add_keys(self, table: Any, streets: Streets, junction: StreetJunction) -> None:
+        """Add the counts to ``[traffic]``; several hours become periods."""
+        flows = tuple(flow for hour in self.hours for flow in hour.flows)
+        names = MovementNames(streets.network, junction.at_m, flows)
+        origin = f"vehicles an hour, from {self.path.name}"
+        if len(self.hours) == 1:
+            table.update({"counts": scenario_files.counts_array(self.hours[0].flows, names)})
+            table["counts"].comment(origin)
+            return
+        table.add(tomlkit.comment(f"{origin}; one period for each hour"))
+        periods = tomlkit.aot()
+        for hour in self.hours:
+            period = tomlkit.table()
+            period.update({"name": hour.name, "weight": 1, "counts": scenario_files.counts_array(hour.flows, names)})
+            periods.append(period)
+        table.add("periods", periods)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from egvs.stages import scene_checks, traffic_checks
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.inputs import CheckInputs, Inputs
 from egvs.stages.scene_dependencies import sensor_digests
+from egvs.traffic import traffic_sources
 from egvs.world import geolocation
 
 RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
@@ -214,7 +215,7 @@ def dependencies(context: StageContext) -> StageDependencies:
     if scenario.traffic.periods:  # frames of a period that fill no block have no weight
         settings["blocks"] = scenario.tpog.blocks
     settings |= _georeference_settings(scenario)
-    return StageDependencies(settings, digests)
+    return StageDependencies(settings, digests, modules=_source_modules(scenario))
 
 
 def scene_dependencies(context: StageContext) -> StageDependencies:
@@ -234,6 +235,17 @@ def _sensor_digests(scenario: Scenario, candidates: tuple[Site, ...]) -> dict[st
         return sensor_digests(scenario, candidates)
     except InputError:
         return {}
+
+
+def _source_modules(scenario: Scenario) -> tuple[str, ...]:
+    """The modules that read recorded traffic; nothing where they cannot be found, which a rule reports."""
+    modules: dict[str, None] = {}
+    for period in scenario.by_period().values():
+        try:
+            modules |= dict.fromkeys(traffic_sources.loaded_modules(period))
+        except InputError:
+            continue
+    return tuple(modules)
 
 
 def _georeference_settings(scenario: Scenario) -> dict[str, Any]:

@@ -41,6 +41,7 @@ from egvs.traffic import (
     signal_plans,
     sumo,
     sumo_folder,
+    traffic_sources,
     trajectories,
 )
 from egvs.traffic.fcd import FrameWindow
@@ -80,7 +81,7 @@ def dependencies(context: StageContext) -> StageDependencies:
         versions["sizes_by"] = _installed_sumo_version()
     modules = list(registry.effect_modules(effects))
     for period_scenario in periods:
-        modules += _reader_modules(period_scenario)
+        modules += traffic_sources.loaded_modules(period_scenario)
     return StageDependencies(settings, digests, versions, tuple(dict.fromkeys(modules)))
 
 
@@ -92,24 +93,11 @@ def _installed_sumo_version() -> str | None:
         return None
 
 
-def _reader_modules(scenario: Scenario) -> list[str]:
-    """The modules that read the recorded tracks of one period; they are loaded by name."""
-    if scenario.traffic.tracks is None and scenario.traffic.pedestrian_tracks is None:
-        return []
-    from egvs.extensions.tracks import recorded_tracks
-
-    return recorded_tracks.track_source(scenario).reader_modules()
-
-
 def _source_files(scenario: Scenario) -> list[Path]:
     """The files that the traffic of one period comes from."""
     traffic = scenario.traffic
     if traffic.tracks is not None:
-        from egvs.extensions.tracks import recorded_tracks
-
-        sources = recorded_tracks.track_files(scenario)
-        if traffic.coverage is not None:
-            sources.append(scenario.find(traffic.coverage, "traffic.coverage"))
+        sources = traffic_sources.source_of(scenario).files(scenario)
         network = sumo_folder.network_path(scenario)
         return sources if network is None else [*sources, network]
     if traffic.fcd is not None:
@@ -120,9 +108,7 @@ def _source_files(scenario: Scenario) -> list[Path]:
     if traffic.sumocfg is not None:
         sources.append(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
     if traffic.pedestrian_tracks is not None:
-        from egvs.extensions.tracks import recorded_tracks
-
-        sources += recorded_tracks.track_files(scenario)
+        sources += traffic_sources.source_of(scenario).files(scenario)
     return [*sources, *sumo_folder.demand_files(scenario).all(), *signal_plans.signal_files(scenario)]
 
 

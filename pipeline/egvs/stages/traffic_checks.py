@@ -12,7 +12,7 @@ from egvs.core.errors import Diagnostic, InputError
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import CheckInputs, ErrorCollector
-from egvs.traffic import demand, fcd, finished_fcd, network, sumo_folder, user_files
+from egvs.traffic import demand, fcd, finished_fcd, network, recording, sumo_folder, traffic_sources, user_files
 from egvs.world import geolocation
 
 Rule = Callable[[CheckInputs], Iterator[Diagnostic]]
@@ -167,28 +167,15 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report finished files without the requested frames, with vehicles of unknown size, or that disappear."""
     scenario = inputs.scenario
     errors = ErrorCollector()
-    if scenario.traffic.tracks is not None:
-        from egvs.extensions.tracks import recorded_tracks
-
-        where = f"{sumo_folder.traffic_location(scenario)}.tracks"
-        world = geolocation.scenario_georeference(scenario)
-        tracks = errors.attempt("traffic", lambda: recorded_tracks.read_recorded_tracks(scenario, world))
-        if tracks is not None:
-            yield from recorded_tracks.track_warnings(tracks, where)
     if scenario.traffic.pedestrian_tracks is not None:
-        from egvs.extensions.tracks import recorded_tracks
-
-        where = f"{sumo_folder.traffic_location(scenario)}.pedestrian_tracks"
-        world = geolocation.scenario_georeference(scenario)
         effects, _ = registry.active_traffic_effects(scenario)
-        are_simulated = any(effect.ADDS_TRAFFIC for effect in effects)
-        errors.attempt("traffic", lambda: recorded_tracks.check_recorded_people(scenario, are_simulated=are_simulated))
-        people = errors.attempt("traffic", lambda: recorded_tracks.read_recorded_pedestrians(scenario, world))
-        if people is not None:
-            yield from recorded_tracks.track_warnings(people, where)
-            first_s = errors.attempt("traffic", lambda: _first_frame_s(scenario))
-            if first_s is not None:
-                yield from recorded_tracks.pedestrian_warnings(people, first_s, where)
+        errors.attempt("traffic", lambda: recording.check_recorded_people(scenario, effects))
+    if traffic_sources.source_key(scenario.traffic) is not None:
+        world = geolocation.scenario_georeference(scenario)
+        try:
+            yield from traffic_sources.source_of(scenario).check(scenario, world)
+        except InputError as error:
+            errors.findings.append(Diagnostic.of("traffic", error))
     if scenario.traffic.fcd is None:
         yield from errors.findings
         return
@@ -198,13 +185,6 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         errors.attempt("traffic", lambda: finished_fcd.check_types(scenario, content.types, content.sizes))
         yield from finished_fcd.presence_warnings(scenario, content)
     yield from errors.findings
-
-
-def _first_frame_s(scenario: Scenario) -> float:
-    """Return the time of the first frame in the simulation."""
-    begin_s = sumo_folder.demand_files(scenario).begin_s
-    timing = sumo_folder.make_timing(scenario.traffic, begin_s, sumo_folder.traffic_location(scenario))
-    return timing.first_ms / 1000.0
 
 
 def check_vehicle_kinds(inputs: CheckInputs) -> Iterator[Diagnostic]:

@@ -41,7 +41,6 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.drawing.basemap import network_file, roads_within, world_outlines
 from egvs.drawing.maps import Backdrop
 from egvs.drawing.svg_figures import extent
-from egvs.extensions.tracks import recorded_tracks
 from egvs.results.ranking import RankedSite, Ranking
 from egvs.runs.run_context import open_folder
 from egvs.runs.stage_registry import recorded_digests
@@ -52,7 +51,7 @@ from egvs.statistics.ranks import rank_agreement, regret
 from egvs.studies import lane_speeds
 from egvs.studies.lane_bins import LaneBins, column_centres_m, lane_bins, lane_distances, mean_groups, sum_groups
 from egvs.studies.paired_errors import SiteReplicates, read_replicates
-from egvs.traffic import network
+from egvs.traffic import network, traffic_sources
 from egvs.world import geolocation
 
 
@@ -304,7 +303,7 @@ def _covered_columns(recorded: StageContext, grid: Grid) -> FloatArray:
     covered = np.ones(grid.shape[0] * grid.shape[1])
     if recorded.scenario.traffic.tracks:
         world = geolocation.scenario_georeference(recorded.scenario)
-        coverage = recorded_tracks.read_recorded_tracks(recorded.scenario, world).coverage
+        coverage = traffic_sources.source_of(recorded.scenario).record(recorded.scenario, world).coverage
         if coverage is not None:
             covered = coverage.contains(column_centres_m(grid)).astype(np.float64)
     return covered

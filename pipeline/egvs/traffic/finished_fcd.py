@@ -36,7 +36,7 @@ from egvs.formats import xml
 from egvs.scenario.fields import Name, Positive, StrictModel
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import VehicleKind
-from egvs.traffic import fcd, sumo, sumo_folder
+from egvs.traffic import fcd, sumo, sumo_folder, traffic_sources
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 _NEVER = -(2**63)
@@ -460,7 +460,5 @@ def recorded_frames(scenario: Scenario) -> int:
     if scenario.traffic.frames is not None:
         return scenario.traffic.frames
     if scenario.traffic.tracks is not None:
-        from egvs.extensions.tracks import recorded_tracks
-
-        return recorded_tracks.tracks_window(scenario).count
+        return traffic_sources.source_of(scenario).frame_count(scenario)
     return fcd_window(scenario)[0].count

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -27,14 +27,12 @@ from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.traffic import fcd, finished_fcd, locks, network, sumo, sumo_folder
+from egvs.traffic import fcd, finished_fcd, locks, network, sumo, sumo_folder, traffic_sources
 from egvs.traffic.count_fit import CountFit, count_fits, missed_count_warnings
 from egvs.traffic.locks import DemandKey, RegionWatch, WatchedRegion, describe_distance
 from egvs.traffic.sumo_folder import SimulationFolder, Timing
+from egvs.traffic.traffic_sources import RecordedTraffic
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
-
-if TYPE_CHECKING:
-    from egvs.extensions.tracks.recorded_tracks import RecordedTracks
 
 _MIN_STANDING_LIMIT_S = 180.0
 _MAX_WAITING_SHARE = 0.02
@@ -203,23 +201,22 @@ def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> I
 
 @contextmanager
 def _record_tracks(scenario: Scenario, folder: Path, world: Georeference) -> Iterator[Recording]:
-    from egvs.extensions.tracks import recorded_tracks
-
     where = sumo_folder.traffic_location(scenario)
     sumo_folder.copy_network(scenario, folder)
-    recorded = recorded_tracks.read_recorded_tracks(scenario, world)
-    source = f"{where}.tracks"
+    recorded = traffic_sources.source_of(scenario).record(scenario, world)
     yield Recording(
-        recorded.rows(),
-        recorded.window,
-        recorded.vehicle_sizes(),
-        where,
-        source=source,
-        uncounted_types=recorded.vulnerable_types(),
-        tracks=recorded.summary(),
-        warnings=tuple(recorded_tracks.track_warnings(recorded, source)),
-        unknown_boxes=recorded.unknown_boxes(),
+        recorded.rows, recorded.window, recorded.sizes, where, source=f"{where}.tracks", **_values_of(recorded)
     )
+
+
+def _values_of(recorded: RecordedTraffic) -> dict[str, Any]:
+    """Return what is known about recorded road users, as attributes of a :class:`Recording`."""
+    return {
+        "uncounted_types": recorded.uncounted_types,
+        "tracks": recorded.summary,
+        "warnings": recorded.warnings,
+        "unknown_boxes": recorded.unknown_boxes,
+    }
 
 
 @contextmanager
@@ -268,14 +265,9 @@ def _record_simulated(
         persons = _read_rows(folder / sumo_folder.PERSONS_FILE, "person") if prepared.has_extra_traffic else None
         people_values: dict[str, Any] = {}
         if people is not None:
-            persons = people.rows(prepared.timing.first_ms)
-            sizes |= people.vehicle_sizes()
-            people_values = {
-                "uncounted_types": people.vulnerable_types(),
-                "tracks": people.summary(),
-                "warnings": tuple(_people_warnings(people, prepared.timing, f"{where}.pedestrian_tracks")),
-                "unknown_boxes": people.unknown_boxes(),
-            }
+            persons = people.rows
+            sizes |= people.sizes
+            people_values = _values_of(people)
         yield Recording(
             _read_rows(folder / sumo_folder.FCD_FILE, "vehicle"),
             prepared.timing.window(),
@@ -299,22 +291,21 @@ def _record_simulated(
 
 def _recorded_people(
     scenario: Scenario, extensions: Sequence[TrafficHook], world: Georeference
-) -> RecordedTracks | None:
+) -> RecordedTraffic | None:
     """Read the recorded pedestrians of a scenario, if there are any; InputError where others are simulated."""
     if scenario.traffic.pedestrian_tracks is None:
         return None
-    from egvs.extensions.tracks import recorded_tracks
+    check_recorded_people(scenario, extensions)
+    return traffic_sources.source_of(scenario).record(scenario, world)
 
+
+def check_recorded_people(scenario: Scenario, extensions: Iterable[TrafficHook]) -> None:
+    """Raise an InputError when people are recorded (``traffic.pedestrian_tracks``) and simulated as well."""
     are_simulated = any(extension.ADDS_TRAFFIC for extension in extensions)
-    recorded_tracks.check_recorded_people(scenario, are_simulated=are_simulated)
-    return recorded_tracks.read_recorded_pedestrians(scenario, world)
-
-
-def _people_warnings(people: RecordedTracks, timing: Timing, where: str) -> Iterator[Diagnostic]:
-    from egvs.extensions.tracks import recorded_tracks
-
-    yield from recorded_tracks.track_warnings(people, where)
-    yield from recorded_tracks.pedestrian_warnings(people, timing.first_ms / 1000.0, where)
+    if are_simulated and scenario.traffic.pedestrian_tracks is not None:
+        where = f"{sumo_folder.traffic_location(scenario)}.pedestrian_tracks"
+        problem = "pedestrians are recorded, and an effect simulates others"
+        raise InputError(where, problem, "Remove effects.pedestrians_bicycles, or pedestrian_tracks.")
 
 
 def _read_rows(path: Path, element: str) -> Iterable[pa.Table]:

@@ -239,14 +239,6 @@ def read_recorded_pedestrians(scenario: Scenario, world: Georeference) -> Record
     return RecordedTracks(window, cleaned, boxes, None, 0, None, sumo_folder.read_network(scenario), first_s)
 
 
-def check_recorded_people(scenario: Scenario, *, are_simulated: bool) -> None:
-    """Raise an InputError when people are recorded (``traffic.pedestrian_tracks``) and simulated as well."""
-    if are_simulated and scenario.traffic.pedestrian_tracks is not None:
-        where = f"{sumo_folder.traffic_location(scenario)}.pedestrian_tracks"
-        problem = "pedestrians are recorded, and an effect simulates others"
-        raise InputError(where, problem, "Remove effects.pedestrians_bicycles, or pedestrian_tracks.")
-
-
 def pedestrian_warnings(people: RecordedTracks, begin_s: float, where: str) -> Iterator[Diagnostic]:
     """Warn that recorded pedestrians and simulated vehicles know nothing of each other.
 

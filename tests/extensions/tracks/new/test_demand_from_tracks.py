@@ -13,6 +13,7 @@ import pytest
 import egvs
 from egvs.core.errors import InputError
 from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
+from egvs.extensions.tracks.new.demand import TrackDemand
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.statistics import intervals
 from egvs.traffic import sumo
@@ -62,16 +63,16 @@ def new_like(folder: Path, network: Path, tracks: Path):  # type: ignore[no-unty
 def test_counts_of_a_recording(tmp_path: Path, network_path: Path) -> None:
     """25 vehicles in ten minutes are 150 an hour; Garwood's limits for 25 are 16.18 and 36.90."""
     new = new_like(tmp_path / "new", network_path, write_recording(tmp_path / "tracks.csv"))
-    assert new.demand is not None
-    assert new.demand.duration_s == SECONDS
+    assert isinstance(new.traffic, TrackDemand)
+    assert new.traffic.duration_s == SECONDS
     assert {(flow.from_edge, flow.to_edge): flow.per_hour for flow in new.flows} == {
         ("in", "out"): 150.0, ("in", "north"): 18.0,
     }  # fmt: skip
-    straight, left = sorted(new.demand.movements, key=lambda movement: -movement.vehicles)
+    straight, left = sorted(new.traffic.movements, key=lambda movement: -movement.vehicles)
     assert (straight.low_per_h, straight.high_per_h) == pytest.approx((6 * 16.1787, 6 * 36.9049), abs=0.01)
     assert straight.comment == "95 %: 97 to 221, from 25 vehicles"
     assert left.comment == "95 %: 4 to 53 (3 vehicles only; enter your own count)"
-    assert new.demand.marked == 1
+    assert new.traffic.marked == 1
     assert any("1 pedestrian" in note for note in new.notes)
 
 
@@ -85,9 +86,9 @@ def test_fleet_of_a_recording(tmp_path: Path, network_path: Path) -> None:
     deviation = np.std([0.9 + 0.01 * number for number in range(25)], ddof=1)
     assert car.attributes == {"speedFactor": f"normc({1.02 + 0.1625 / 10:.3f},{deviation:.3f},0.2,2)"}
     assert truck.attributes == {}
-    assert new.demand is not None
-    assert [estimate.has_default_size for estimate in new.demand.fleet] == [False, True]
-    assert "sizes of vehicles (truck)" in new.demand.assumptions
+    assert isinstance(new.traffic, TrackDemand)
+    assert [estimate.has_default_size for estimate in new.traffic.fleet] == [False, True]
+    assert "sizes of vehicles (truck)" in new.traffic.assumptions
 
 
 def test_intervals_and_marks_are_in_the_scenario(tmp_path: Path, network_path: Path) -> None:
@@ -220,16 +221,16 @@ def test_demand_of_a_simulation_is_recovered(tmp_path: Path) -> None:
     """Counts, fleet, desired speeds and minimum gap of SUMO's vehicles lie in the stated intervals."""
     network, tracks = simulate(tmp_path)
     new = new_like(tmp_path / "new", network, tracks)
-    assert new.demand is not None
-    assert new.demand.duration_s == pytest.approx(END_S - WARMUP_S, abs=1.0)
-    recorded = {(each.flow.from_edge, each.flow.to_edge): each for each in new.demand.movements}
+    assert isinstance(new.traffic, TrackDemand)
+    assert new.traffic.duration_s == pytest.approx(END_S - WARMUP_S, abs=1.0)
+    recorded = {(each.flow.from_edge, each.flow.to_edge): each for each in new.traffic.movements}
     for movement, per_hour in TRUE_FLOWS.items():
         assert recorded[movement].low_per_h <= per_hour <= recorded[movement].high_per_h
         assert recorded[movement].is_usable
     others = [each.vehicles for movement, each in recorded.items() if movement not in TRUE_FLOWS]
     assert sum(others) <= 2
     car, truck = egvs.load(tmp_path / "new").traffic.kinds
-    total = sum(each.vehicles for each in new.demand.movements)
+    total = sum(each.vehicles for each in new.traffic.movements)
     low, high = intervals.share_interval(round(truck.share * total), total)
     assert low <= TRUCK_SHARE <= high
     assert car.length_m == pytest.approx(4.5, abs=0.01)
@@ -237,7 +238,7 @@ def test_demand_of_a_simulation_is_recovered(tmp_path: Path) -> None:
 
     assert car.attributes["tau"] == pytest.approx(1.0, abs=0.05)
 
-    comments = {estimate.kind.name: " ".join(estimate.comments) for estimate in new.demand.fleet}
+    comments = {estimate.kind.name: " ".join(estimate.comments) for estimate in new.traffic.fleet}
     for name, mean, deviation in (("car", TRUE_SPEED, TRUE_DEVIATION), ("truck", 1.0, 0.05)):
         words = comments[name].partition("speedFactor mean ")[2].split()
         # fast vehicles are free less often: over nine seeds, the mean of cars is 0.004 too low
@@ -262,11 +263,11 @@ def test_karlsruhe(tmp_path: Path, karlsruhe: Path) -> None:
         signals=(karlsruhe / "signal_phases_000.csv.gz", karlsruhe / "k733_map.kml.gz"),
     )
     new = create_scenario(tmp_path / "new", karlsruhe / "k733_lanelet2.osm.gz", options=options)
-    assert new.demand is not None
-    assert new.demand.marked == len(new.demand.movements)
-    vehicles = sum(movement.vehicles for movement in new.demand.movements)
+    assert isinstance(new.traffic, TrackDemand)
+    assert new.traffic.marked == len(new.traffic.movements)
+    vehicles = sum(movement.vehicles for movement in new.traffic.movements)
     assert 50 <= vehicles <= 58
-    assert new.demand.fleet[0].has_default_size
+    assert new.traffic.fleet[0].has_default_size
     assert any("The signals repeat a recorded cycle of 88.0 s" in note for note in new.notes)
     network = (tmp_path / "new" / "network.net.xml").read_text(encoding="utf-8")
     phases = [phase.attrib for phase in ElementTree.fromstring(network).iter("phase")]

@@ -12,6 +12,7 @@ from egvs.core.errors import InputError
 from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
 from egvs.extensions.tracks.model import Tracks
 from egvs.extensions.tracks.new.files import TrackFiles
+from egvs.extensions.tracks.new.traffic import ReplayedVehicles
 from tests.creation.small_maps import degrees, street, write_map
 from tests.extensions.tracks.boxes import assert_same_boxes, moving_boxes
 from tests.extensions.tracks.writers_json import write_dair_v2x, write_tumtraf
@@ -106,9 +107,9 @@ def test_junction_is_that_of_the_tracks(tmp_path: Path) -> None:
     (tmp_path / "meta_data.csv").write_text(f"id,originLat,originLon\n000,{lat_deg},{lon_deg}\n")
     new = create_scenario(tmp_path / "new", road_map, options=NewScenarioOptions(tracks=(tracks,)))
     assert "East Street" in new.junction.title
-    assert new.recorded is not None
-    assert new.recorded.alignment is not None
-    assert new.recorded.alignment.share == 1.0
+    assert isinstance(new.traffic, ReplayedVehicles)
+    assert new.traffic.recorded.alignment is not None
+    assert new.traffic.recorded.alignment.share == 1.0
     assert new.flows == ()
     assert egvs.load(tmp_path / "new").traffic.tracks == ("tracks/vehicle_tracks_000.csv",)
 
@@ -119,7 +120,7 @@ def test_tracks_in_metres_of_the_map(tmp_path: Path) -> None:
     tracks = write_tracks(tmp_path / "tracks.csv", x_m=at_m[0] - 50.0, y_m=at_m[1] - 1.6)
     options = NewScenarioOptions(tracks=(tracks,), track_crs="world")
     new = create_scenario(tmp_path / "new", road_map, degrees((0.0, 0.0)), options)
-    assert new.recorded is not None
+    assert isinstance(new.traffic, ReplayedVehicles)
     assert egvs.load(tmp_path / "new").traffic.track_crs == "world"
 
 

@@ -214,7 +214,7 @@ def test_chongqing(tmp_path: Path) -> None:
         pedestrian_tracks=(SIND / "chongqing_pedestrians.csv.gz",), signals=(SIND / "chongqing_signals.csv",)
     )
     scenario = create_scenario(tmp_path / "new", SIND / "chongqing_lanelet2.osm", options=options)
-    (first, second) = [note for note in scenario.signal_notes if note.startswith("Guessed")]
+    (first, second) = [note for note in scenario.notes if note.startswith("Guessed")]
     assert "vehicle traffic light 1 governs road_-100001, road_-100010 (62 % of the time that 26 people" in first
     assert "vehicle traffic light 2 governs road_-100004, road_-100007 (62 %" in second
     clock = read_net_xml(tmp_path / "new" / "network.net.xml").signal_clock

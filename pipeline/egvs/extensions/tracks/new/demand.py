@@ -13,10 +13,14 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tomlkit
 
 from egvs.core.errors import InputError
 from egvs.core.wording import number_of
-from egvs.creation import junctions
+from egvs.creation import junctions, scenario_files
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.extensions.tracks import demand as track_demand
 from egvs.extensions.tracks.alignment import Alignment
@@ -27,6 +31,7 @@ from egvs.extensions.tracks.new.motion import MatchedRecording
 from egvs.scenario.traffic_config import CountConfig
 from egvs.statistics import intervals
 from egvs.statistics.intervals import MIN_OBSERVATIONS
+from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import CAR, Network
 
 
@@ -77,6 +82,8 @@ class TrackDemand:
     notes: tuple[str, ...]
     alignment: Alignment | None
 
+    is_recorded = True
+
     @property
     def flows(self) -> tuple[CountConfig, ...]:
         """The counts of the scenario."""
@@ -114,6 +121,32 @@ class TrackDemand:
         if self.marked:
             text += f", {self.marked} of them with fewer than {MIN_OBSERVATIONS} vehicles"
         return text
+
+    def warnings(self, scenario_file: Path) -> Iterator[str]:
+        """Warn about counts from few vehicles, and about tracks beside the lanes."""
+        if self.marked:
+            yield (
+                f"{self.marked} of {len(self.movements)} counts come from fewer than {MIN_OBSERVATIONS} vehicles. Enter"
+                f" your own counts under [traffic] in {scenario_file}; they are marked there, with their intervals."
+            )
+        if self.alignment is not None:
+            for warning in self.alignment.warnings("--like"):
+                yield str(warning)
+
+    def add_keys(self, table: Any, streets: Streets, junction: StreetJunction) -> None:
+        """Add kinds and counts, with their intervals, to ``[traffic]``."""
+        names = MovementNames(streets.network, junction.at_m, self.flows)
+        kinds = [estimate.kind for estimate in self.fleet]
+        table.update({"kinds": scenario_files.kinds_array(kinds, [estimate.comments for estimate in self.fleet])})
+        table["kinds"].comment("estimated from the recorded vehicles")
+        comments = [movement.comment for movement in self.movements]
+        table.update({"counts": scenario_files.counts_array(self.flows, names, comments)})
+        table["counts"].comment(f"vehicles an hour, from {self.duration_s:,.0f} s of recorded tracks")
+        table.add(
+            tomlkit.comment("The profile of the day is not extrapolated from the recording; it is yours to enter.")
+        )
+        for line in scenario_files.periods_template(max(self.flows, key=lambda flow: flow.per_hour)):
+            table.add(tomlkit.comment(line))
 
 
 def estimate_demand(recording: MatchedRecording, streets: Streets, junction: StreetJunction) -> TrackDemand:
