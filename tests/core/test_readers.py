@@ -91,7 +91,8 @@ def test_module_decides_where_the_table_cannot(site: Path) -> None:  # noqa: F81
 
 
 def test_content_comes_first_and_no_package_replaces_a_reader_of_this_program(site: Path) -> None:  # noqa: F811
-    rows = "Reader('by name', 'map', 'plug_a', suffixes=('.w', '.osm')), Reader('zz', 'map', 'plug_b', ('.w',), None, b'z')"
+    by_name = "Reader('by name', 'map', 'plug_a', suffixes=('.w', '.osm'))"
+    rows = f"{by_name}, Reader('zz', 'map', 'plug_b', suffixes=('.w',), content=b'z')"
     install_readers(site, "aaa", rows, {"plug_a": "", "plug_b": ""})
     for name, text, expected in (("a.w", "z", "zz"), ("a.w", "y", "by name"), ("a.osm", "z", "OpenStreetMap")):
         (site / name).write_text(text)
