@@ -8,7 +8,7 @@ group ``egvs.readers``::
 
 A file may be of a format if its name ends with one of the format's suffixes, or if it begins as files of the format
 do; and, where the format states so, if it contains what they contain. Only then is the reader's module imported. If it
-has a function ``can_open(path, head)``, that decides.
+has a function ``can_open(path, head)``, that decides; of a damaged file it may raise an InputError.
 
 Readers of this program are asked first, so an installed package cannot replace one of them; among those of one origin,
 readers that look into the content come first: a Lanelet2 map is an OpenStreetMap file with lanelets.
@@ -105,7 +105,7 @@ def list_readers(kind: str) -> list[Reader]:
     return [reader for reader in _table() if reader.kind == kind]
 
 
-def find_reader(kind: str, path: Path, head: bytes | None = None) -> Reader | None:
+def find_reader(kind: str, path: Path) -> Reader | None:
     """Return the reader of a file; None if there is none.
 
     Parameters
@@ -114,8 +114,6 @@ def find_reader(kind: str, path: Path, head: bytes | None = None) -> Reader | No
         One of :data:`KINDS`.
     path
         The file.
-    head
-        Its beginning, from :func:`read_head`; read if it is None.
 
     Raises
     ------
@@ -124,7 +122,7 @@ def find_reader(kind: str, path: Path, head: bytes | None = None) -> Reader | No
     MissingBackendError
         When a reader that may open the file cannot be imported.
     """
-    head = read_head(path) if head is None else head
+    head = read_head(path)
     for reader in list_readers(kind):
         if reader.may_open(path, head) and _confirms(reader, path, head):
             return reader

@@ -44,11 +44,9 @@ class MapFile:
     @property
     def module(self) -> Any:
         """The reader's module (:mod:`egvs.creation.map_parts`); MissingBackendError when it cannot be used."""
-        module = readers.load_reader(self.reader)
-        functions = [_FUNCTIONS[part] for part in self.reader.gives]
-        if hasattr(module, "open_roads"):
-            functions = [name for name in functions if name != _FUNCTIONS[ROADS]]
-        return readers.load_reader(self.reader, tuple(functions), _EXPECTED)
+        needs_no_read_roads = hasattr(readers.load_reader(self.reader), "open_roads")
+        parts = [part for part in self.reader.gives if part != ROADS or not needs_no_read_roads]
+        return readers.load_reader(self.reader, tuple(_FUNCTIONS[part] for part in parts), _EXPECTED)
 
 
 @dataclass(frozen=True)
