@@ -67,7 +67,6 @@ class OsmRoads:
     others: OtherLevels = _ONE_LEVEL
     attribution: str = ATTRIBUTION
     notes: tuple[str, ...] = ()
-    keeps_heights: bool = False
 
     @classmethod
     def read(cls, path: Path, options: RoadOptions) -> OsmRoads:
@@ -100,6 +99,11 @@ class OsmRoads:
                 flags += elevation.ELEVATION_FLAGS
         network, streets = osm_network.build_network(extract, path, flags)
         return cls(extract, path, tuple(flags), network, streets, notes=notes)
+
+    @property
+    def keeps_heights(self) -> bool:
+        """False: heights of the map (``ele``) count from sea level."""
+        return False
 
     @property
     def level_notes(self) -> tuple[str, ...]:
