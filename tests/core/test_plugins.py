@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from egvs.core import plugins
+from egvs.core import plugins, readers
 from egvs.core.errors import InputError, MissingBackendError, MissingExtraError
 
 GROUP = "egvs.test_group"
@@ -22,6 +22,13 @@ def install(folder: Path, package: str, entries: str, modules: dict[str, str], g
     (info / "entry_points.txt").write_text(f"[{group}]\n{entries}\n", encoding="utf-8")
     for name, source in modules.items():
         (folder / f"{name}.py").write_text(source, encoding="utf-8")
+
+
+def install_readers(folder: Path, package: str, rows: str, modules: dict[str, str]) -> None:
+    """Lay a package with readers into a folder; ``rows`` are the calls that make them."""
+    declarations = f"from egvs.core.readers import Reader\nREADERS = ({rows},)\n"
+    name = f"plug_{package.replace('-', '_')}_readers"
+    install(folder, package, f"{package} = {name}:READERS", {name: declarations, **modules}, readers.GROUP)
 
 
 @pytest.fixture
@@ -40,6 +47,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def clear_caches() -> None:
     plugins.load_plugin.cache_clear()
     plugins._entry_points_by_name.cache_clear()
+    readers._table.cache_clear()
 
 
 def test_plugin_names_are_sorted_without_imports(site: Path) -> None:
@@ -90,21 +98,13 @@ def test_interrupt_while_loading_is_passed_on(site: Path) -> None:
         plugins.load_plugin(GROUP, "a")
 
 
-@pytest.mark.parametrize(
-    ("group", "entry", "lacks"),
-    [
-        ("egvs.effects", "collections:OrderedDict", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
-        ("egvs.effects", "plug_a:TABLE", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
-        ("egvs.effects", "plug_a", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
-        ("egvs.effects", "egvs.effects.base:Detect", "NAME, SOURCE, Model.from_dict; expected a subclass"),
-        ("egvs.point_clouds", "plug_a", "read; expected a module or an object with a function read"),
-    ],
-)
-def test_rejects_object_without_required_attributes(site: Path, group: str, entry: str, lacks: str) -> None:
-    install(site, "somebody-elses", f"zz = {entry}", {"plug_a": "TABLE = {}"}, group)
-    message = rf"cannot be loaded: it has no {lacks}.* \(entry point '{entry}' of the package somebody-elses\)"
+def test_check_names_missing_attributes_and_the_package(site: Path) -> None:
+    install(site, "somebody-elses", "zz = collections:OrderedDict", {})
+    plugin = plugins.load_plugin(GROUP, "zz")
+    plugins.check_plugin(GROUP, "zz", plugin, ("items", "fromkeys.__call__"), "a dictionary")
+    message = r"it has no NAME, items\.b; expected a dictionary \(entry point .* of the package somebody-elses\)"
     with pytest.raises(MissingBackendError, match=message):
-        plugins.load_plugin(group, "zz")
+        plugins.check_plugin(GROUP, "zz", plugin, ("NAME", "items", "items.b"), "a dictionary")
 
 
 def test_rejects_entry_point_without_module(site: Path) -> None:

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from egvs.core.errors import InputError
-from egvs.creation import map_readers, sumo_network
-from egvs.creation.openstreetmap import reader as openstreetmap
+from egvs.core.errors import InputError, MissingBackendError
+from egvs.creation import map_readers
+from tests.core.test_plugins import install_readers, site  # noqa: F401  the fixture
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 NETWORK = SCENARIOS / "roundabout" / "network.net.xml"
@@ -20,8 +20,8 @@ def test_finds_readers_by_name_and_content(tmp_path: Path) -> None:
     packed = tmp_path / "packed.xml.gz"
     packed.write_bytes(gzip.compress(NETWORK.read_bytes()))
     for path in (NETWORK, renamed, packed):
-        assert map_readers.find_reader(path) is sumo_network
-    assert map_readers.find_reader(SMALL) is openstreetmap
+        assert map_readers.find_reader(path).name == "SUMO network"
+    assert map_readers.find_reader(SMALL).name == "OpenStreetMap"
 
 
 def test_openstreetmap_with_another_road_map_has_static_objects_only() -> None:
@@ -82,7 +82,7 @@ def test_rejects_unreadable_file_in_folder_by_name(tmp_path: Path, monkeypatch: 
 def test_surface_model_has_heights(tmp_path: Path) -> None:
     (tmp_path / "surface.asc").write_text("ncols 2")
     (file,) = map_readers.open_surface([tmp_path / "surface.asc"])
-    assert file.reader.NAME == "GeoTIFF or ASCII grid"
+    assert file.reader.name == "GeoTIFF or ASCII grid"
     with pytest.raises(InputError, match=r"small.osm: expected a surface model, got OpenStreetMap"):
         map_readers.open_surface([SMALL])
 
@@ -97,11 +97,20 @@ def test_network_made_from_openstreetmap_is_a_network(tmp_path: Path) -> None:
     path = tmp_path / "roads.xml"
     head, root, rest = NETWORK.read_text(encoding="utf-8").partition("<net ")
     path.write_text(f'{head}<!-- <osm-files value="town.osm"/> -->\n{root}{rest}', encoding="utf-8")
-    assert map_readers.find_reader(path) is sumo_network
+    assert map_readers.find_reader(path).name == "SUMO network"
 
 
 @pytest.mark.parametrize(("faces", "reader"), [(0, "point cloud"), (1, "triangle mesh")])
 def test_ply_is_a_mesh_if_it_has_faces(tmp_path: Path, faces: int, reader: str) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nelement face %d\nend_header\n" % faces)
-    assert reader == map_readers.find_reader(path).NAME
+    assert reader == map_readers.find_reader(path).name
+
+
+def test_module_without_what_its_reader_gives_is_rejected(site: Path) -> None:  # noqa: F811
+    rows = "Reader('walls', 'map', 'plug_walls', suffixes=('.walls',), gives=('roads', 'solids'))"
+    install_readers(site, "somebody-elses", rows, {"plug_walls": "def open_roads(path, options): ..."})
+    (site / "a.walls").write_text("")
+    file = map_readers.MapFile(site / "a.walls", map_readers.find_reader(site / "a.walls"))
+    with pytest.raises(MissingBackendError, match="plug_walls has no read_solids; expected a module with read_roads"):
+        _ = file.module

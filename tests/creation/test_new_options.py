@@ -15,8 +15,8 @@ from egvs.core.errors import InputError
 from egvs.creation import assumed_traffic, building_heights, junctions, new_scenario, scenario_files
 from egvs.creation.assumed_traffic import AssumedTraffic
 from egvs.creation.new_scenario import NewScenario
+from egvs.creation.openstreetmap import ATTRIBUTION, street_network
 from egvs.creation.openstreetmap import solids as osm_solids
-from egvs.creation.openstreetmap import street_network
 from egvs.formats import osm
 from egvs.runs import run
 from egvs.scenario import loading
@@ -64,7 +64,7 @@ def write_all_solids(folder: Path, extract: Path) -> None:
     _, streets = street_network.build_network(read, extract, flags)
     mapped, counts = osm_solids.map_solids(read, streets)
     solids = building_heights.heights_from_neighbours(mapped, counts, ())
-    text = scenario_files.solids_geojson(solids, counts)
+    text = scenario_files.solids_geojson(solids, counts, (ATTRIBUTION,))
     assert '"way/9"' in text
     (folder / "statics.geojson").write_text(text, encoding="utf-8")
 

@@ -5,7 +5,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,9 +16,10 @@ from pyproj import CRS
 from shapely.geometry import box
 
 from egvs.core.errors import InputError
+from egvs.core.readers import Reader
 from egvs.creation import alignment, static_objects, sumo_network
 from egvs.creation.map_parts import ImportCounts, MapContext, MappedMesh, MappedSolid, SolidMap
-from egvs.creation.map_readers import MapFile
+from egvs.creation.map_readers import MapFile, find_reader
 from egvs.creation.new_scenario import assumed_sizes, scenario_notes
 from egvs.creation.road_source import NetworkRoads
 from egvs.creation.static_objects import REPLACED
@@ -46,16 +47,26 @@ def block(name: str, low_m: Sequence[float], size_m: Sequence[float]) -> MappedM
     return MappedMesh(name, "building", _CORNERS * size_m + low_m, _BOX_FACES, True)
 
 
-def reader(name: str, solid_map: SolidMap) -> MapFile:
+@dataclass(frozen=True)
+class GivenMap(MapFile):
     """A map file whose reader returns a given map."""
-    return MapFile(Path(f"{name}.map"), SimpleNamespace(NAME=name, read_solids=lambda paths, context: solid_map))
+
+    solid_map: SolidMap
+
+    @property
+    def module(self) -> SimpleNamespace:
+        return SimpleNamespace(read_solids=lambda paths, context: self.solid_map)
+
+
+def reader(name: str, solid_map: SolidMap) -> MapFile:
+    return GivenMap(Path(f"{name}.map"), Reader(name, "map", "given", gives=("solids",)), solid_map)
 
 
 def collect(*maps: MapFile, zero_height_m: float | None = None, **options: Any) -> static_objects.StaticObjects:
     """Collect objects around the roundabout, whose lanes lie within 50 m of 0, 0."""
     roads = NetworkRoads.read(sumo_network.read_roads(ROUNDABOUT, sumo_network.RoadOptions()), ROUNDABOUT)
     context = MapContext(None, box(-300, -300, 300, 300), streets=roads.streets)
-    read = static_objects.read_maps(maps, roads, MapFile(ROUNDABOUT, sumo_network), context)
+    read = static_objects.read_maps(maps, roads, MapFile(ROUNDABOUT, find_reader(ROUNDABOUT)), context)
     return static_objects.collect_objects(read, roads.streets, (0.0, 0.0), zero_height_m, **options)
 
 

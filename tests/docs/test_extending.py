@@ -3,18 +3,23 @@ else's would be, and used by name."""
 
 from __future__ import annotations
 
+import json
+import math
 import re
 import tomllib
 from pathlib import Path
 
 import pytest
+from pyproj import Transformer
 
 import egvs
 from tests import processes
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
+SMALL = Path(__file__).resolve().parents[1] / "creation" / "data" / "small.osm"
 _BLOCK = re.compile(r'^```\w+ title="([^"]+)"\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 _LINES = 35  # what a page of thirty lines may come to
+_CODE_LINES = 30
 
 
 def package(heading: str) -> dict[str, str]:
@@ -58,20 +63,23 @@ def scores(folder: Path) -> list[float]:
 
 
 @pytest.mark.parametrize(
-    "heading",
+    ("heading", "n_modules"),
     [
-        "An effect",
-        "A format of point clouds",
-        "A format of recorded tracks",
-        "A score",
-        "A command",
-        "A section of the report",
+        ("An effect", 1),
+        ("A map format", 2),
+        ("A format of point clouds", 2),
+        ("A format of recorded tracks", 2),
+        ("A score", 1),
+        ("A command", 1),
+        ("A section of the report", 1),
     ],
 )
-def test_the_example_is_short(heading: str) -> None:
+def test_the_example_is_short(heading: str, n_modules: int) -> None:
     modules = [text for name, text in package(heading).items() if name.endswith(".py")]
-    assert len(modules) == 1
-    assert len(modules[0].splitlines()) <= _LINES
+    assert len(modules) == n_modules
+    assert max(len(text.splitlines()) for text in modules) <= _LINES
+    lines = [line for text in modules for line in text.splitlines() if line.strip()]
+    assert len(lines) <= _CODE_LINES
 
 
 @pytest.mark.slow
@@ -103,6 +111,34 @@ def test_an_effect_of_another_package_is_listed_and_checked(mini: Path, tmp_path
         "run", mini, "--out", tmp_path / "out", "--set", "effects.blind_zone.nearest_m=1", beside=tmp_path
     )
     assert code == 2 and "unknown effect" in text, text
+
+
+@pytest.mark.system
+def test_a_map_format_of_another_package_is_read(tmp_path: Path) -> None:
+    """A wall of 20 m and 2.5 m height beside the junction of the test's extract, and one far away."""
+    beside = install(package("A map format"), tmp_path / "installed")
+    east_m, north_m = Transformer.from_crs("EPSG:4326", "EPSG:25832", always_xy=True).transform(10.0, 52.0)
+    rows = [(east_m + 40 + far, north_m + 25, east_m + 60 + far, north_m + 25, 2.5) for far in (0, 50_000)]
+    (tmp_path / "site.walls").write_text("".join(" ".join(map(str, row)) + "\n" for row in rows))
+    code, text = run_egvs("new", tmp_path / "made", "--from", SMALL, tmp_path / "site.walls", beside=beside)
+    assert code == 0 and "wall list" in text, text
+    statics = json.loads((tmp_path / "made" / "statics.geojson").read_text())
+    (wall,) = (f for f in statics["features"] if f["properties"]["name"].startswith("site/"))
+    assert wall["properties"]["height_m"] == 2.5
+    (x0, y0), (x1, y1) = wall["geometry"]["coordinates"]
+    assert math.hypot(x1 - x0, y1 - y0) == pytest.approx(20, abs=0.05)
+    code, text = run_egvs("new", tmp_path / "other", "--from", SMALL, tmp_path / "site.walls", beside=tmp_path)
+    assert code == 2 and "site.walls: the format of the file is unknown" in text and "OpenStreetMap" in text, text
+
+
+@pytest.mark.system
+def test_a_package_with_a_former_group_gets_one_message(tmp_path: Path) -> None:
+    files = package("A map format")
+    files["pyproject.toml"] = files["pyproject.toml"].replace("egvs.readers", "egvs.maps")
+    beside = install(files, tmp_path / "installed")
+    code, text = run_egvs("new", tmp_path / "made", "--from", SMALL, beside=beside)
+    assert code != 0 and "Traceback" not in text
+    assert "the group egvs.maps is now egvs.readers" in text and "of the package egvs-walls" in text
 
 
 @pytest.mark.slow
@@ -151,7 +187,8 @@ import math, sys, pathlib
 from egvs.extensions.tracks import sources
 path = pathlib.Path(sys.argv[1])
 reader = sources.find_reader(path)
-assert reader.NAME == "radar tracks" and "SinD tracks" in sources.describe_formats()
+assert reader.__name__ == "egvs_radar_tracks"
+assert {"radar tracks", "SinD tracks"} <= set(sources.describe_formats().split(", "))
 tracks = reader.read(path)
 assert tracks.names == ("7",) and tracks.classes == ("car",) and tracks.frame.offset_m == (5e5, 5.6e6)
 box = [float(column[0]) for column in (tracks.time_s, tracks.x_m, tracks.y_m, tracks.yaw_rad, tracks.length_m)]

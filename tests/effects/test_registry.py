@@ -141,6 +141,22 @@ def test_rejects_plugin_that_is_not_an_effect_of_that_name(site: Path, source: s
         registry.load_effect_class("zz")
 
 
+@pytest.mark.parametrize(
+    ("entry", "lacks"),
+    [
+        ("collections:OrderedDict", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
+        ("plug_z:TABLE", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
+        ("plug_z", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
+        ("egvs.effects.base:Detect", "NAME, SOURCE, Model.from_dict; expected a subclass"),
+    ],
+)
+def test_rejects_object_that_is_no_effect(site: Path, entry: str, lacks: str) -> None:  # noqa: F811
+    install(site, "somebody-elses", f"zz = {entry}", {"plug_z": "TABLE = {}"}, "egvs.effects")
+    message = rf"cannot be loaded: it has no {lacks}.* \(entry point '{entry}' of the package somebody-elses\)"
+    with pytest.raises(MissingBackendError, match=message):
+        registry.load_effect_class("zz")
+
+
 @pytest.mark.system
 def test_rejects_two_effects_with_one_name(mini, tmp_path):
     """Their parameters would overwrite each other in the cache key of the stage."""

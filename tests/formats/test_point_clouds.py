@@ -15,14 +15,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from egvs.core import plugins
+from egvs.core import readers
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.formats import las as las_format
 from egvs.formats import pcd as pcd_format
 from egvs.formats import ply as ply_format
-from egvs.formats.point_clouds import GROUP, read_points, stream_points, write_points
+from egvs.formats.point_clouds import KIND, read_points, stream_points, write_points
 from tests import processes
-from tests.core.test_plugins import install, site  # noqa: F401  the fixture
+from tests.core.test_plugins import install_readers, site  # noqa: F401  the fixture
 
 needs_laspy = pytest.mark.skipif(importlib.util.find_spec("laspy") is None, reason="laspy is not installed (egvs[las])")
 quick = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -606,21 +606,20 @@ def test_random_damage_gives_points_or_input_error(tmp_path: Path, name: str, da
 FOO_FORMAT = """
 import numpy as np
 
-class Foo:
+def read(path, where):
     "Points as text, one number a line."
+    return np.array([float(word) for word in path.read_text().split()]).reshape(-1, 3)
 
-    def read(self, path, where):
-        return np.array([float(word) for word in path.read_text().split()]).reshape(-1, 3)
-
-    def write(self, path, points_m):
-        path.write_text("\\n".join(map(repr, points_m.ravel().tolist())))
-
-class Bar:
-    def read(self, path, where):
-        return np.zeros((1, 3))
-
-FOO, BAR = Foo(), Bar()
+def write(path, points_m):
+    path.write_text("\\n".join(map(repr, points_m.ravel().tolist())))
 """
+BAR_FORMAT = """
+import numpy as np
+
+def read(path, where):
+    return np.zeros((1, 3))
+"""
+FOO, BAR = (f"Reader('{name}', 'points', 'plug_{name}', suffixes=('.{name}',))" for name in ("foo", "bar"))
 
 WRITE_AND_READ = """
 import sys
@@ -641,7 +640,8 @@ except InputError as error:
 
 @pytest.mark.system
 def test_package_adds_a_format(tmp_path: Path) -> None:
-    install(tmp_path / "site", "foo", "foo = foo_points:FOO\nbar = foo_points:BAR", {"foo_points": FOO_FORMAT}, GROUP)
+    (tmp_path / "site").mkdir()
+    install_readers(tmp_path / "site", "foo", f"{FOO}, {BAR}", {"plug_foo": FOO_FORMAT, "plug_bar": BAR_FORMAT})
     done = processes.python(WRITE_AND_READ, tmp_path / "a.FOO", beside=tmp_path / "site")
     assert done.returncode == 0, done.stderr
     assert "a.bar: unknown file format '.bar'. Use one of .foo, .pcd, .ply" in done.stdout
@@ -649,9 +649,10 @@ def test_package_adds_a_format(tmp_path: Path) -> None:
 
 @pytest.mark.system
 def test_formats_of_this_program_can_be_read() -> None:
-    assert {"csv", "las", "laz", "pcd", "ply"} <= set(plugins.plugin_names(GROUP))
-    for name in plugins.plugin_names(GROUP):
-        assert callable(plugins.load_plugin(GROUP, name).read)
+    suffixes = {suffix for reader in readers.list_readers(KIND) for suffix in reader.suffixes}
+    assert {".csv", ".las", ".laz", ".pcd", ".ply"} <= suffixes
+    for reader in readers.list_readers(KIND):
+        assert callable(readers.load_reader(reader).read)
 
 
 @pytest.mark.system
@@ -690,14 +691,14 @@ def read(path, where):
     ],
 )
 def test_message_names_failing_reader_and_file(site: Path, body: str, problem: str) -> None:  # noqa: F811
-    install(site, "foo", "foo = plug_foo", {"plug_foo": READER.format(body)}, GROUP)
+    install_readers(site, "foo", FOO, {"plug_foo": READER.format(body)})
     with pytest.raises(InputError, match=rf"a\.foo: its reader plug_foo \(package foo\) {problem}"):
         read_points(site / "a.foo", "sites.csv: row A")
 
 
 @pytest.mark.system
 def test_integer_points_become_float64(site: Path) -> None:  # noqa: F811
-    install(site, "foo", "foo = plug_foo", {"plug_foo": READER.format("return np.array([[1, 2, 3]])")}, GROUP)
+    install_readers(site, "foo", FOO, {"plug_foo": READER.format("return np.array([[1, 2, 3]])")})
     points, dropped = read_points(site / "a.foo", "")
     assert (points.dtype, points.tolist(), dropped) == (np.float64, [[1.0, 2.0, 3.0]], 0)
 
@@ -705,15 +706,15 @@ def test_integer_points_become_float64(site: Path) -> None:  # noqa: F811
 @pytest.mark.system
 def test_input_error_of_reader_is_passed_on(site: Path) -> None:  # noqa: F811
     body = "from egvs.core.errors import InputError; raise InputError(where, 'the file is empty', 'Add a point.')"
-    install(site, "foo", "foo = plug_foo", {"plug_foo": READER.format(body)}, GROUP)
+    install_readers(site, "foo", FOO, {"plug_foo": READER.format(body)})
     with pytest.raises(InputError, match=r"a\.foo: the file is empty\. Add a point\.$"):
         read_points(site / "a.foo", "")
 
 
 @pytest.mark.system
 def test_format_without_read_is_rejected_and_does_not_disable_others(site: Path) -> None:  # noqa: F811
-    install(site, "foo", "foo = plug_foo", {"plug_foo": ""}, GROUP)
-    with pytest.raises(MissingBackendError, match=r"it has no read; .*'plug_foo' of the package foo"):
+    install_readers(site, "foo", FOO, {"plug_foo": ""})
+    with pytest.raises(MissingBackendError, match=r"plug_foo has no read; .* of the package foo"):
         read_points(site / "a.foo", "")
     write_points(site / "a.ply", np.ones((1, 3)))
     assert read_points(site / "a.ply", "")[0].tolist() == [[1.0, 1.0, 1.0]]

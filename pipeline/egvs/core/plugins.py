@@ -1,8 +1,9 @@
-"""Plug-ins: effects, file formats, detectors and scores, declared as entry points and loaded on first use.
+"""Plug-ins: effects, readers, detectors and scores, declared as entry points and loaded on first use.
 
-A group, e.g. ``egvs.point_clouds``, is a table of entry points: name -> ``module:object``. The parts of this program
+A group, e.g. ``egvs.effects``, is a table of entry points: name -> ``module:object``. The parts of this program
 are declared the same way, in its own ``pyproject.toml``. Where two packages declare one name, this program has
 priority, then the packages in the order of their names; so an installed package cannot replace a part of this program.
+Who calls the objects of a group defines what they must have, and checks it (:func:`check_plugin`).
 
 https://packaging.python.org/en/latest/specifications/entry-points/
 """
@@ -20,31 +21,6 @@ from egvs.core.wording import by_number
 
 PACKAGE_NAME = "egvs"
 """The package of this program."""
-
-_REQUIREMENTS = {
-    "egvs.effects": (
-        ("NAME", "SOURCE", "STAGE", "KIND", "Model.from_dict"),
-        "a subclass of Detect or another kind in egvs.effects.base, with NAME, SOURCE and Model",
-    ),
-    "egvs.detectors": (
-        ("NAME", "SOURCE", "settings", "at_site"),
-        "a class with NAME, SOURCE, settings and at_site, see detectors.base of the extension validation",
-    ),
-    "egvs.scores": (
-        ("name", "formula", "source", "sign", "function"),
-        "a SurrogateScore, see surrogates of the extension validation",
-    ),
-    "egvs.maps": (
-        ("NAME", "can_open"),
-        "a module with NAME, can_open and read_roads, read_solids or read_terrain, see egvs.creation.map_parts",
-    ),
-    "egvs.tracks": (
-        ("NAME", "can_open", "companions", "read"),
-        "a module with NAME, can_open, companions and read, see egvs.extensions.tracks.model",
-    ),
-    "egvs.point_clouds": (("read",), "a module or an object with a function read"),
-}
-"""Required attributes of the objects of each group, and a description for messages."""
 
 _PACKAGES = {
     "PIL": "Pillow",
@@ -116,24 +92,37 @@ def load_plugin(group: str, name: str) -> Any:
     InputError
         When the group declares no such name.
     MissingBackendError
-        When the object cannot be imported, or lacks an attribute that its group requires: names the package that
-        declares it, and its entry point.
+        When the object cannot be imported: names the package that declares it, and its entry point.
     """
     entry = _entry_points_by_name(group).get(name)
     if entry is None:
         known = ", ".join(plugin_names(group)) or "none"
         raise InputError(group, f"unknown name {name!r}", f"Choose one of {known}.")
     try:
-        plugin = entry.load()
+        return entry.load()
     except (ImportError, AttributeError, SyntaxError) as error:
         raise plugin_error(group, name, str(error)) from error
     except (Exception, SystemExit) as error:  # a foreign module may do anything when it is imported
         raise plugin_error(group, name, f"its import raised {error!r}") from error
-    required, description = _REQUIREMENTS.get(group, ((), ""))
+
+
+def check_plugin(group: str, name: str, plugin: object, required: tuple[str, ...], expected: str) -> None:
+    """Raise a MissingBackendError if an object lacks an attribute.
+
+    Parameters
+    ----------
+    group, name
+        The entry point that it was loaded from, for the message.
+    plugin
+        The object.
+    required
+        Names of attributes, which may be nested: ``Model.from_dict``.
+    expected
+        What an object of this group is, for the message.
+    """
     missing = [attribute for attribute in required if not _has_attribute(plugin, attribute)]
     if missing:
-        raise plugin_error(group, name, f"it has no {', '.join(missing)}; expected {description}")
-    return plugin
+        raise plugin_error(group, name, f"it has no {', '.join(missing)}; expected {expected}")
 
 
 @cache

@@ -25,7 +25,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY, FloatArray
 from egvs.creation.junctions import JunctionRegion, StreetJunction, Streets
-from egvs.creation.openstreetmap.street_network import NETWORK_FILE
+from egvs.creation.plain_network import NETWORK_FILE
 from egvs.traffic.approach_names import ApproachNames
 from egvs.traffic.directions import compass
 from egvs.traffic.network import Edge, Lane, Network

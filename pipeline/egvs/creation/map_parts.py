@@ -1,7 +1,7 @@
 """What the readers of map files return: roads, solids and terrain, all in one world frame.
 
-A reader is a module with ``NAME`` and ``can_open``, and with one or more of ``read_roads``, ``read_solids`` and
-``read_terrain``. It is declared as an entry point of the group ``egvs.maps``.
+A reader is a module with one or more of ``read_roads`` (or ``open_roads``), ``read_solids`` and ``read_terrain``. It is
+in the table of readers (:mod:`egvs.core.readers`), which says what it gives.
 
 The world frame is that of the network: x east, y north in metres (see :mod:`egvs.formats.georeference`). Roads are read
 first; the ``<location>`` of their network states the frame. The other readers convert their coordinates with
@@ -21,14 +21,11 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import FloatArray, IntArray, Roi
 from egvs.creation.junctions import Streets
 from egvs.formats.georeference import WorldFrame, parse_crs
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import StaticsConfig
-
-HEAD_BYTES = 4096
-"""How much of a file :meth:`MapReader.can_open` gets, after gunzip."""
 
 DEFAULT_BUILDING_M: float = StaticsConfig.model_fields["polygon_height_m"].default
 """Height of a building without a height in the map, and of no special type."""
@@ -161,12 +158,15 @@ class RoadMap:
         Sentences for the user: what was assumed, left out or is wrong in the map.
     has_heights
         Whether the z of its lanes comes from the map.
+    keeps_heights
+        Whether its heights are used as they are: z = 0 is that of the network, not the ground at the junction.
     """
 
     network: str
     attribution: str = ""
     notes: tuple[str, ...] = ()
     has_heights: bool = False
+    keeps_heights: bool = False
 
 
 @dataclass(frozen=True)
@@ -182,11 +182,15 @@ class RoadOptions:
     has_terrain
         Whether the roads will be laid on a terrain: heights of OpenStreetMap are not needed then, but its bridges and
         tunnels stay edges of their own.
+    at
+        Latitude, longitude in degrees of the requested junction, or x, y in metres if the map has no reference system;
+        None if any will do. A reader may reject a position outside its map.
     """
 
     lefthand: bool = False
     walk: bool = False
     has_terrain: bool = False
+    at: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -236,6 +240,9 @@ class SolidMap:
         Sentences for the user.
     attribution
         Who made the map, and its licence; empty if unknown.
+    is_base
+        Whether it is a map of everything: its buildings give way to those of other maps, and its objects are clear of
+        the carriageway already.
     """
 
     solids: tuple[MappedSolid, ...] = ()
@@ -244,6 +251,20 @@ class SolidMap:
     has_absolute_heights: bool = False
     notes: tuple[str, ...] = ()
     attribution: str = ""
+    is_base: bool = False
+
+    def unseen_shares(self, sensors_m: FloatArray, roi: Roi) -> FloatArray | None:
+        """Return the share of each sensor's view that no survey saw, (n,); None if the map is no survey.
+
+        Parameters
+        ----------
+        sensors_m
+            Sensors, (n, 3), in the frame of the meshes.
+        roi
+            The region of interest, in the same frame.
+        """
+        del sensors_m, roi
+        return None
 
 
 class Terrain(Protocol):
@@ -377,19 +398,12 @@ class MapContext:
 
 
 @runtime_checkable
-class MapReader(Protocol):
-    """What every reader has."""
+class RoadReader(Protocol):
+    """A module that reads roads.
 
-    NAME: str
-
-    def can_open(self, path: Path, head: bytes) -> bool:
-        """Return whether a file with this name and beginning (:data:`HEAD_BYTES`) is in the reader's format."""
-        raise NotImplementedError
-
-
-@runtime_checkable
-class RoadReader(MapReader, Protocol):
-    """A reader of roads."""
+    One whose roads can be divided by level, or cut better than any network, has ``open_roads(path, options)`` instead,
+    which returns a :class:`~egvs.creation.road_source.RoadSource`.
+    """
 
     def read_roads(self, path: Path, options: RoadOptions) -> RoadMap:
         """Return the network of a road map; InputError when it is damaged."""
@@ -397,8 +411,8 @@ class RoadReader(MapReader, Protocol):
 
 
 @runtime_checkable
-class SolidReader(MapReader, Protocol):
-    """A reader of static objects. Files of one format are read together, since objects may be cut at their borders."""
+class SolidReader(Protocol):
+    """A module that reads static objects. Files of one format are read together: objects may be cut at borders."""
 
     def read_solids(self, paths: Sequence[Path], context: MapContext) -> SolidMap:
         """Return the objects in the window; InputError when a file is damaged."""
@@ -406,8 +420,8 @@ class SolidReader(MapReader, Protocol):
 
 
 @runtime_checkable
-class TerrainReader(MapReader, Protocol):
-    """A reader of ground heights."""
+class TerrainReader(Protocol):
+    """A module that reads ground heights."""
 
     def read_terrain(self, paths: Sequence[Path], context: MapContext) -> Terrain:
         """Return the ground in the window; InputError when a file is damaged."""

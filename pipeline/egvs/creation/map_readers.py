@@ -1,44 +1,52 @@
 """Find the reader of each map file, and what the files contain: roads, solids, terrain.
 
-Readers are entry points of the group ``egvs.maps`` (see :mod:`egvs.creation.map_parts`). A file is opened by the first
-reader, in the order of their names, whose ``can_open`` accepts it. A folder stands for the files in it.
+Readers are in the table of :mod:`egvs.core.readers`; what their modules have, says :mod:`egvs.creation.map_parts`. A
+folder stands for the files in it.
 """
 
 from __future__ import annotations
 
-import gzip
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egvs.core import plugins
-from egvs.core.digests import open_input
+from egvs.core import readers
 from egvs.core.errors import InputError
-from egvs.creation.map_parts import HEAD_BYTES, MapReader
+from egvs.core.readers import Reader
 
-GROUP = "egvs.maps"
+KIND = "map"
+"""Kind of the readers of maps."""
 
-ROADS, SOLIDS, TERRAIN = "read_roads", "read_solids", "read_terrain"
-"""Functions of readers, for what a file can contain."""
+ROADS, SOLIDS, TERRAIN = "roads", "solids", "terrain"
+"""What a map file can contain."""
+
+_FUNCTIONS = {ROADS: "read_roads", SOLIDS: "read_solids", TERRAIN: "read_terrain"}
+"""Function of a reader's module for each part; a module with ``open_roads`` needs no ``read_roads``."""
+
+_EXPECTED = "a module with read_roads or open_roads, read_solids, or read_terrain, see egvs.creation.map_parts"
 
 MAX_FILES = 1000
 """Largest number of files of a folder."""
 
-_GZIP = b"\x1f\x8b"
-
 
 @dataclass(frozen=True)
 class MapFile:
-    """A map file and its reader (:mod:`egvs.creation.map_parts`)."""
+    """A map file and its reader."""
 
     path: Path
-    reader: Any
+    reader: Reader
 
     def has(self, part: str) -> bool:
         """Return whether the reader can read :data:`ROADS`, :data:`SOLIDS` or :data:`TERRAIN`."""
-        return hasattr(self.reader, part)
+        return part in self.reader.gives
+
+    @property
+    def module(self) -> Any:
+        """The reader's module (:mod:`egvs.creation.map_parts`); MissingBackendError when it cannot be used."""
+        needs_no_read_roads = hasattr(readers.load_reader(self.reader), "open_roads")
+        parts = [part for part in self.reader.gives if part != ROADS or not needs_no_read_roads]
+        return readers.load_reader(self.reader, tuple(_FUNCTIONS[part] for part in parts), _EXPECTED)
 
 
 @dataclass(frozen=True)
@@ -102,7 +110,7 @@ def open_surface(paths: Sequence[Path]) -> tuple[MapFile, ...]:
     for file in maps:
         if not file.has(TERRAIN):
             formats = describe_formats(TERRAIN)
-            raise InputError(file.path, f"expected a surface model, got {file.reader.NAME}", f"Formats: {formats}.")
+            raise InputError(file.path, f"expected a surface model, got {file.reader.name}", f"Formats: {formats}.")
     return maps
 
 
@@ -129,43 +137,18 @@ def list_files(paths: Sequence[Path]) -> list[Path]:
     return list(listed)
 
 
-def find_reader(path: Path) -> MapReader:
+def find_reader(path: Path) -> Reader:
     """Return the reader of a file; InputError when it does not exist or no reader accepts it."""
-    head = read_head(path)
-    for reader in _readers():
-        if reader.can_open(path, head):
-            return reader
-    raise InputError(path, "the format of the file is unknown", f"Formats: {describe_formats()}.")
-
-
-def read_head(path: Path) -> bytes:
-    """Return the first bytes of a file, after gunzip where possible; InputError when it cannot be read."""
-    if not path.is_file():
-        raise InputError(path, "no such file", "Check the path.")
-    try:
-        with open_input(path) as content:
-            head: bytes = content.read(HEAD_BYTES)
-    except OSError as error:
-        problem = f"the file cannot be read ({error.strerror or error})"
-        raise InputError(path, problem, "Check its permissions, or leave it out.") from None
-    if not head.startswith(_GZIP):
-        return head
-    try:
-        with open_input(path) as content, gzip.open(content) as unzipped:
-            return unzipped.read(HEAD_BYTES)
-    except (EOFError, OSError, zlib.error):  # damaged: its reader says so
-        return head
+    reader = readers.find_reader(KIND, path)
+    if reader is None:
+        raise InputError(path, "the format of the file is unknown", f"Formats: {describe_formats()}.")
+    return reader
 
 
 def describe_formats(part: str | None = None) -> str:
-    """Return the names of the readers, or of those that read :data:`ROADS`, :data:`SOLIDS` or :data:`TERRAIN`."""
-    return ", ".join(reader.NAME for reader in _readers() if part is None or hasattr(reader, part))
+    """Return the names of the formats, or of those with :data:`ROADS`, :data:`SOLIDS` or :data:`TERRAIN`."""
+    return readers.describe_formats(KIND, part)
 
 
 def _can_be_opened(path: Path) -> bool:
-    head = read_head(path)
-    return any(reader.can_open(path, head) for reader in _readers())
-
-
-def _readers() -> list[MapReader]:
-    return [plugins.load_plugin(GROUP, name) for name in plugins.plugin_names(GROUP)]
+    return readers.find_reader(KIND, path) is not None

@@ -24,7 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tomlkit
@@ -59,11 +59,8 @@ from egvs.creation.map_parts import (
 )
 from egvs.creation.map_readers import MapFile, MapFiles
 from egvs.creation.new_traffic import NewTraffic, RecordingOptions, RecordingPlan, ScenarioTraffic
-from egvs.creation.openstreetmap import overpass
-from egvs.creation.openstreetmap import reader as openstreetmap
-from egvs.creation.openstreetmap.overpass import DownloadedExtract
-from egvs.creation.openstreetmap.reader import OsmRoads
-from egvs.creation.openstreetmap.street_network import ATTRIBUTION, NETWORK_FILE
+from egvs.creation.openstreetmap import ATTRIBUTION
+from egvs.creation.plain_network import NETWORK_FILE
 from egvs.creation.road_source import NetworkRoads, RoadSource
 from egvs.creation.scenario_files import (
     PITCHES_DEG,
@@ -89,6 +86,9 @@ from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.sumo import SumoInputError
 from egvs.world.static_world import build_world
 from egvs.world.terrain import TerrainSurface
+
+if TYPE_CHECKING:
+    from egvs.creation.openstreetmap.overpass import DownloadedExtract
 
 SURROUNDINGS_MIN_M = 100.0
 FAR_FROM_AT_M = 50.0
@@ -229,8 +229,8 @@ class NewScenarioOptions:
     walk
         Whether the network gets sidewalks and crossings, which pedestrians need.
     surroundings_m
-        Distance from the junction at which streets end; inf for the complete map. By default,
-        :data:`openstreetmap.SURROUNDINGS_M` for OpenStreetMap, and inf for other maps.
+        Distance from the junction at which streets end; inf for the complete map. The default depends on the format of
+        the map.
     traffic
         A key of :data:`assumed_traffic.TRAFFIC_LEVELS`: the share of the flow that the junction carries. Or vehicles
         per hour.
@@ -433,8 +433,8 @@ def _open_files(
 
 def _read_roads_and_recordings(draft: _Draft) -> None:
     """Read all roads of the map, and find the reader of each recording."""
-    options = RoadOptions(draft.options.lefthand, draft.options.walk, has_terrain=bool(draft.files.terrain))
-    draft.map_roads = _read_roads(draft.files.roads, options, draft.at)
+    options = RoadOptions(draft.options.lefthand, draft.options.walk, bool(draft.files.terrain), draft.at)
+    draft.map_roads = _read_roads(draft.files.roads, options)
     draft.recordings = new_traffic.find_recordings(draft.options.recordings)
 
 
@@ -634,6 +634,8 @@ def download_map(
     """
     if at is None:
         raise InputError("--download", "needs a point", "Add --at LAT,LON, such as --at 50.8704,9.7080.")
+    from egvs.creation.openstreetmap import overpass  # other maps need none of it
+
     options.check()
     scenario_files.check_new_folder(folder)
     return overpass.download_extract(at, options.surroundings_m, url)
@@ -695,10 +697,12 @@ def _terrain_points(terrain: Terrain, window: BaseGeometry, zero_height_m: float
     return points_m
 
 
-def _read_roads(file: MapFile, options: RoadOptions, at: tuple[float, float] | None) -> RoadSource:
-    if file.reader is openstreetmap:
-        return OsmRoads.read(file.path, options, at)
-    return NetworkRoads.read(file.reader.read_roads(file.path, options), file.path)
+def _read_roads(file: MapFile, options: RoadOptions) -> RoadSource:
+    module = file.module
+    if hasattr(module, "open_roads"):
+        roads: RoadSource = module.open_roads(file.path, options)
+        return roads
+    return NetworkRoads.read(module.read_roads(file.path, options), file.path)
 
 
 def _choose_junction(
@@ -782,10 +786,7 @@ def _surface_notes(surface: Terrain | None, counts: ImportCounts) -> list[str]:
 
 
 def _level_notes(roads: RoadSource, counts: ImportCounts) -> list[str]:
-    notes = []
-    if isinstance(roads, OsmRoads) and roads.others.roads:
-        titles = ", ".join(roads.others.road_titles)
-        notes.append(f"Roads on another level are left out of the traffic in the region of interest: {titles}.")
+    notes = list(roads.level_notes)
     heights = counts.heights.get("bridge", Counter())
     if heights["default"]:
         shares = f"{heights['default']} of {heights.total()}"

@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
+from shapely.geometry.base import BaseGeometry
+
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.creation import junctions
 from egvs.creation.junctions import StreetJunction, Streets
-from egvs.creation.map_parts import RoadMap
-from egvs.creation.openstreetmap.street_network import NETWORK_FILE
+from egvs.creation.map_parts import RoadMap, SolidMap
+from egvs.creation.plain_network import NETWORK_FILE
 from egvs.traffic import sumo
 
 _GENERATED = re.compile(r"<!-- generated on .*?-->\n*", re.DOTALL)
@@ -43,12 +45,30 @@ class RoadSource(Protocol):
         """Sentences for the user about the complete map."""
         raise NotImplementedError
 
+    @property
+    def keeps_heights(self) -> bool:
+        """Whether its heights are used as they are (:class:`~egvs.creation.map_parts.RoadMap`)."""
+        raise NotImplementedError
+
+    @property
+    def level_notes(self) -> tuple[str, ...]:
+        """Sentences for the user about roads that :meth:`on_level_of` left out."""
+        raise NotImplementedError
+
     def on_level_of(self, junction: StreetJunction) -> RoadSource:
         """Return the roads without those that cross a junction's region on another level."""
         raise NotImplementedError
 
     def around(self, junction: StreetJunction, radius_m: float | None) -> RoadSource:
         """Return the roads within a radius of a junction, in the same frame: all if it is inf, the default if None."""
+        raise NotImplementedError
+
+    def edge_levels(self) -> dict[str, int]:
+        """Return the levels of the edges that are known not to be on the ground: bridges and tunnels."""
+        raise NotImplementedError
+
+    def solids(self, window: BaseGeometry) -> SolidMap | None:
+        """Return the static objects of the road map in a window (world frame, metres); None: its reader reads them."""
         raise NotImplementedError
 
 
@@ -97,6 +117,25 @@ class NetworkRoads:
     def notes(self) -> tuple[str, ...]:
         """Sentences of the reader."""
         return self.road_map.notes
+
+    @property
+    def keeps_heights(self) -> bool:
+        """Whether its heights are used as they are."""
+        return self.road_map.keeps_heights
+
+    @property
+    def level_notes(self) -> tuple[str, ...]:
+        """No sentences, since no road is left out."""
+        return ()
+
+    def edge_levels(self) -> dict[str, int]:
+        """Return no levels: only heights of lanes tell them."""
+        return {}
+
+    def solids(self, window: BaseGeometry) -> SolidMap | None:
+        """Return None: static objects are read apart from roads."""
+        del window
+        return None
 
     def on_level_of(self, junction: StreetJunction) -> NetworkRoads:
         """Return all roads: heights of lanes tell levels apart."""

@@ -23,7 +23,7 @@ from egvs.core.grid import FloatArray
 from egvs.creation import junctions
 from egvs.creation.junctions import JunctionRegion, KerbsidePole
 from egvs.creation.map_parts import ImportCounts, MappedSolid
-from egvs.creation.openstreetmap.street_network import ATTRIBUTION, NETWORK_FILE
+from egvs.creation.plain_network import NETWORK_FILE
 from egvs.scenario.fields import Name
 from egvs.scenario.model import RoiConfig
 from egvs.scenario.score_config import DEFAULT_SCORE, ScoreConfig
@@ -86,9 +86,7 @@ def check_new_folder(folder: Path) -> str:
     return ""
 
 
-def solids_geojson(
-    solids: Sequence[MappedSolid], counts: ImportCounts, attributions: Sequence[str] = (ATTRIBUTION,)
-) -> str:
+def solids_geojson(solids: Sequence[MappedSolid], counts: ImportCounts, attributions: Sequence[str]) -> str:
     """Return GeoJSON in world-frame metres, one feature per line, with the import counts in its head."""
     head = {
         "type": "FeatureCollection",

@@ -2,7 +2,7 @@
 
 Footprints become ``statics.geojson``; meshes become one PLY file for each kind of object. Steps of
 :func:`collect_objects`: lower meshes whose heights count from sea level to the network's ground, and lift those whose
-heights count from a sloping ground; drop buildings of OpenStreetMap where another map has one; cut footprints that
+heights count from a sloping ground; drop buildings of a base map where another map has one; cut footprints that
 cover the carriageway, and name meshes that do; give buildings without a height that of a surface model or of their
 neighbours.
 
@@ -27,21 +27,18 @@ from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
 from egvs.core.wording import by_number, list_first, number_of
 from egvs.creation import building_heights
+from egvs.creation.carriageway import clear_of_carriageway
 from egvs.creation.junctions import Streets
 from egvs.creation.map_parts import OBJECT_KIND, ImportCounts, MapContext, MappedMesh, MappedSolid, SolidMap, Terrain
 from egvs.creation.map_readers import MapFile
-from egvs.creation.openstreetmap import reader as openstreetmap
-from egvs.creation.openstreetmap import solids as osm_solids
-from egvs.creation.openstreetmap.reader import OsmRoads
 from egvs.creation.road_source import RoadSource
-from egvs.extensions.maps.point_clouds.as_built_view import AsBuiltMap
 from egvs.world.terrain import TerrainSurface
 
 REPLACED = "replaced_by_another_map"
-"""The reason to leave out a building of OpenStreetMap."""
+"""The reason to leave out a building of a base map."""
 
 _COVERED_SHARE = 0.3
-"""A building of OpenStreetMap is left out if another map's building covers this share of it."""
+"""A building of a base map is left out if another map's building covers this share of it."""
 
 _NEAREST_BASES = 20
 """Number of meshes whose lowest points tell the height of the ground, where no terrain does."""
@@ -141,7 +138,7 @@ class ReadMap:
 
 
 def read_maps(maps: Sequence[MapFile], roads: RoadSource, road_file: MapFile, context: MapContext) -> list[ReadMap]:
-    """Read the static objects of all maps, OpenStreetMap last.
+    """Read the static objects of all maps, base maps last: other maps replace their buildings.
 
     Parameters
     ----------
@@ -160,14 +157,11 @@ def read_maps(maps: Sequence[MapFile], roads: RoadSource, road_file: MapFile, co
     read = []
     for group in _group_by_reader(maps):
         paths = tuple(file.path for file in group)
-        reader = group[0].reader
-        if isinstance(roads, OsmRoads) and paths == (road_file.path,):
-            solids, counts = roads.solids(context.window)
-            objects = SolidMap(tuple(solids), counts=counts, attribution=roads.attribution)
-        else:
-            objects = reader.read_solids(paths, context)
-        read.append(ReadMap(paths, reader.NAME, objects))
-    return read
+        objects = roads.solids(context.window) if paths == (road_file.path,) else None
+        if objects is None:
+            objects = group[0].module.read_solids(paths, context)
+        read.append(ReadMap(paths, group[0].reader.name, objects))
+    return sorted(read, key=lambda read_map: read_map.objects.is_base)
 
 
 def unseen_shares(maps: Sequence[ReadMap], sites_m: FloatArray, roi: Roi) -> FloatArray | None:
@@ -182,8 +176,11 @@ def unseen_shares(maps: Sequence[ReadMap], sites_m: FloatArray, roi: Roi) -> Flo
     roi
         The region of interest, in the same frame.
     """
-    surveys = [read.objects for read in maps if isinstance(read.objects, AsBuiltMap)]
-    return surveys[0].unseen_shares(sites_m, roi) if surveys else None
+    for read in maps:
+        shares = read.objects.unseen_shares(sites_m, roi)
+        if shares is not None:
+            return shares
+    return None
 
 
 def ground_mesh(maps: Sequence[ReadMap]) -> MappedMesh | None:
@@ -227,8 +224,8 @@ def collect_objects(
     """
     collected = StaticObjects(zero_height_m=zero_height_m)
     for read in maps:
-        if read.reader == openstreetmap.NAME:
-            objects = _without_replaced(read.objects, collected)  # the carriageway is clear already
+        if read.objects.is_base:
+            objects = _without_replaced(read.objects, collected)
         else:
             objects, subtracted_m = _lower_to_ground(read, middle_m, zero_height_m)
             if collected.zero_height_m is None and subtracted_m is not None:
@@ -301,10 +298,10 @@ def _write_ply(meshes: Sequence[MappedMesh], path: Path) -> None:
 
 
 def _group_by_reader(maps: Sequence[MapFile]) -> list[list[MapFile]]:
-    """Return the files of each reader, OpenStreetMap last: other maps replace its buildings."""
+    """Return the files of each reader."""
     groups: dict[str, list[MapFile]] = {}
-    for file in sorted(maps, key=lambda file: file.reader is openstreetmap):
-        groups.setdefault(file.reader.NAME, []).append(file)
+    for file in maps:
+        groups.setdefault(file.reader.name, []).append(file)
     return list(groups.values())
 
 
@@ -374,7 +371,7 @@ def _clear_of_carriageway(solid_map: SolidMap, streets: Streets, ground: Terrain
     solids: list[MappedSolid] = []
     counts = replace(solid_map.counts, objects=Counter(), heights={}) if solid_map.solids else solid_map.counts
     for solid in solid_map.solids:
-        solids += osm_solids.clear_of_carriageway(solid, lanes, counts)
+        solids += clear_of_carriageway(solid, lanes, counts)
 
     def ground_m(xy_m: FloatArray) -> FloatArray:
         return np.zeros(len(xy_m)) if ground is None else ground.height_m(*xy_m.T)

@@ -11,15 +11,8 @@ from egvs.core.errors import InputError
 from egvs.creation.map_parts import RoadMap, RoadOptions
 from egvs.traffic import network
 
-NAME = "SUMO network"
-
 _GENERATOR = re.compile(r"<!-- generated on .*?-->\s*", re.DOTALL)
 _GZIP = b"\x1f\x8b"
-
-
-def can_open(path: Path, head: bytes) -> bool:
-    """Return whether a file is named ``.net.xml``, or begins as a network."""
-    return path.name.lower().removesuffix(".gz").endswith(".net.xml") or b"<net " in head
 
 
 def read_roads(path: Path, options: RoadOptions) -> RoadMap:
@@ -43,7 +36,7 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         raise InputError(option, f"the SUMO network {path} has its own side of the road and sidewalks", hint)
     roads = network.read_net_xml(path)
     text = _GENERATOR.sub("", _read_text(path), count=1)
-    return RoadMap(text, has_heights=roads.has_heights)
+    return RoadMap(text, has_heights=roads.has_heights, keeps_heights=True)
 
 
 def _read_text(path: Path) -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from egvs.core import plugins
 from egvs.effects import base
-from egvs.scenario.effects_config import GROUP, EffectParameters, EffectsConfig
+from egvs.scenario.effects_config import GROUP, EffectParameters, EffectsConfig, load_effect
 from egvs.scenario.model import Scenario
 from egvs.traffic import sumo_folder
 from egvs.traffic.vehicle_boxes import VehicleSize
@@ -47,7 +47,7 @@ def load_effect_class(name: str) -> type[base.Effect[Any]]:
         When it cannot be imported, is not an effect, or has another name than its entry point: two effects of one name
         would overwrite each other's parameters in :func:`effect_settings`.
     """
-    effect_class = plugins.load_plugin(GROUP, name)
+    effect_class = load_effect(name)
     if not (isinstance(effect_class, type) and issubclass(effect_class, _BASE_CLASSES)):
         class_names = ", ".join(base_class.__name__ for base_class in _BASE_CLASSES)
         problem = f"expected a subclass of {class_names} of {base.Effect.__module__}, got {effect_class!r}"

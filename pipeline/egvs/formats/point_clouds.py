@@ -1,11 +1,10 @@
-"""Read and write point clouds of any file format (entry points of the group ``egvs.point_clouds``).
+"""Read and write point clouds of any format in the table of readers (:mod:`egvs.core.readers`).
 
 Steps of :func:`read_points`: find the format by the file's suffix; read the file; drop, and count, the points that are
 NaN or infinite, which mark missing returns. Incomplete files are rejected.
 
-The name of an entry point is the suffix without the dot; its object has a function ``read`` and may have ``write`` and
-``crs_of`` (:class:`PointFormat`). The formats of this program are modules of this package, declared in
-``pyproject.toml``; other packages may add theirs (``docs/extending.md``).
+The module of a format has a function ``read`` and may have ``write`` and ``crs_of`` (:class:`PointFormat`). The formats
+of this program are in :mod:`egvs.formats.readers`; other packages may add theirs (``docs/extending.md``).
 
 Points are in the world frame (right-handed, x east, y north, z up), metres, float64, or in the coordinate reference
 system that the file declares (:func:`point_cloud_crs`).
@@ -16,24 +15,26 @@ records, or from blocks of one field each. Numbers in text files are read as flo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self, runtime_checkable
+from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core import limits, plugins
+from egvs.core import limits, readers
 from egvs.core.errors import EgvsError, InputError, MissingBackendError
 from egvs.core.files import atomic_write
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
+from egvs.core.readers import Reader
 from egvs.core.reading import COMPLETE_FILE, describe_exception, translate_errors
 
-GROUP = "egvs.point_clouds"
+KIND = "points"
+"""Kind of the readers of point clouds."""
 
 
 class PointFormat(Protocol):
@@ -132,12 +133,12 @@ def read_points(path: Path, where: str) -> PointCloud:
 
 def _read_all(path: Path, where: str) -> FloatArray:
     """Return all points of a file, (n, 3) float64, including those that are not finite."""
-    suffix = _readable_suffix(path, where)
-    point_format: PointFormat = plugins.load_plugin(GROUP, suffix)
+    reader = _find_reader(path, where)
+    point_format: PointFormat = _load_format(reader)
     if path.is_file():
         limits.checked_size(path, limits.FILE, where)
-    reader = f"its reader {plugins.plugin_module(GROUP, suffix)} (package {plugins.plugin_package(GROUP, suffix)})"
-    return _read_with(point_format, path, where, reader)
+    title = f"its reader {reader.module} (package {readers.reader_package(reader)})"
+    return _read_with(point_format, path, where, title)
 
 
 def _read_with(point_format: PointFormat, path: Path, where: str, reader: str) -> FloatArray:
@@ -178,8 +179,7 @@ def stream_points(path: Path, where: str) -> Iterator[PointChunk]:
         number where they come in chunks.
     """
     where = _with_path(where, path)
-    suffix = _readable_suffix(path, where)
-    point_format = plugins.load_plugin(GROUP, suffix)
+    point_format = _load_format(_find_reader(path, where))
     if not isinstance(point_format, StreamedFormat):
         yield PointChunk(0, None, _read_all(path, where))
         return
@@ -194,13 +194,13 @@ def point_cloud_crs(path: Path, where: str) -> str | None:
     For a file that :func:`read_points` has read; InputError at ``where`` when the declaration is damaged.
     """
     where = _with_path(where, path)
-    point_format = plugins.load_plugin(GROUP, _readable_suffix(path, where))
+    point_format = _load_format(_find_reader(path, where))
     return point_format.crs_of(path, where) if isinstance(point_format, LocatedFormat) else None
 
 
 def format_of_file(path: Path, where: str) -> str:
     """Return the module that reads files with this suffix; InputError at ``where`` if no reader knows the suffix."""
-    return plugins.plugin_module(GROUP, _readable_suffix(path, _with_path(where, path)))
+    return _find_reader(path, _with_path(where, path)).module
 
 
 def write_points(path: Path, points_m: FloatArray) -> None:
@@ -220,12 +220,12 @@ def write_points(path: Path, points_m: FloatArray) -> None:
         When no format with that suffix can be written.
     """
     writable: dict[str, WritableFormat] = {}
-    for name in plugins.plugin_names(GROUP):
+    for suffix, reader in _readers_by_suffix().items():
         with suppress(MissingBackendError):  # a broken plug-in must not disable the others
-            point_format = plugins.load_plugin(GROUP, name)
+            point_format = _load_format(reader)
             if hasattr(point_format, "write"):
-                writable[name] = point_format
-    suffix = _known_suffix(path, path, list(writable))
+                writable[suffix] = point_format
+    suffix = _known_suffix(path, path, writable)
     if points_m.ndim != 2 or points_m.shape[1] != 3:
         raise ValueError(f"points_m has the shape {points_m.shape}, not (n, 3)")
     with atomic_write(path) as partial:
@@ -239,17 +239,28 @@ def _with_path(where: str, path: Path) -> str:
     return f"{where}: {path}" if where else str(path)
 
 
-def _readable_suffix(path: Path, where: str) -> str:
-    return _known_suffix(path, where, plugins.plugin_names(GROUP))
+def _readers_by_suffix() -> dict[str, Reader]:
+    """Return the readers of point clouds by suffix; of several, the first one."""
+    by_suffix = {suffix: reader for reader in reversed(readers.list_readers(KIND)) for suffix in reader.suffixes}
+    return dict(sorted(by_suffix.items()))
 
 
-def _known_suffix(path: Path, where: object, known: list[str]) -> str:
-    """Return the suffix of a file without the dot; InputError unless it is known."""
-    suffix = path.suffix.lower().removeprefix(".")
+def _find_reader(path: Path, where: str) -> Reader:
+    by_suffix = _readers_by_suffix()
+    return by_suffix[_known_suffix(path, where, by_suffix)]
+
+
+def _load_format(reader: Reader) -> Any:
+    return readers.load_reader(reader, ("read",), "a module with a function read")
+
+
+def _known_suffix(path: Path, where: object, known: Iterable[str]) -> str:
+    """Return the suffix of a file; InputError unless it is known."""
+    suffix = path.suffix.lower()
     if suffix in known:
         return suffix
     problem = f"unknown file format {path.suffix!r}" if path.suffix else "the file name has no suffix"
-    raise InputError(where, problem, f"Use one of {', '.join(f'.{name}' for name in known)}.")
+    raise InputError(where, problem, f"Use one of {', '.join(known)}.")
 
 
 AXES = ("x", "y", "z")

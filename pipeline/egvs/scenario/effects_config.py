@@ -251,6 +251,15 @@ class EffectsConfig(StrictModel):
 EffectsConfig.BUILT_IN = tuple(EffectsConfig.model_fields)
 
 
+def load_effect(name: str) -> Any:
+    """Import the class of an effect; MissingBackendError when it cannot be imported or is not one."""
+    effect_class = plugins.load_plugin(GROUP, name)
+    required = ("NAME", "SOURCE", "STAGE", "KIND", "Model.from_dict")
+    expected = "a subclass of Detect or another kind in egvs.effects.base, with NAME, SOURCE and Model"
+    plugins.check_plugin(GROUP, name, effect_class, required, expected)
+    return effect_class
+
+
 def _check_plugin_parameters(name: str, values: object) -> EffectParameters:
     """Return the parameters of an effect of another package."""
     known = list(dict.fromkeys([*EffectsConfig.BUILT_IN, *plugins.plugin_names(GROUP)]))
@@ -260,7 +269,7 @@ def _check_plugin_parameters(name: str, values: object) -> EffectParameters:
         raise PydanticCustomError("unknown_effect", "unknown effect", {"name": name, "hint": hint})
     if isinstance(values, EffectParameters):
         return values
-    model: type[EffectParameters] = plugins.load_plugin(GROUP, name).Model
+    model: type[EffectParameters] = load_effect(name).Model
     try:
         return model.from_dict(values)  # type: ignore[arg-type]
     except ValidationError as error:

@@ -9,11 +9,10 @@ import pytest
 import shapely
 
 from egvs.core.errors import InputError
-from egvs.creation.map_parts import MapContext, TerrainReader
-from egvs.extensions.maps.buildings import citygml
+from egvs.creation.map_parts import MapContext
 from egvs.extensions.maps.terrain import citygml_relief
 from tests.extensions.maps.formats.small_city_models import city_object, nest, polygon, write_model
-from tests.extensions.maps.test_citygml import FRAME, at, house
+from tests.extensions.maps.test_citygml import FRAME, at
 
 CONTEXT = MapContext(FRAME, shapely.box(-20, -20, 20, 20))
 
@@ -46,18 +45,6 @@ def test_heights_are_those_of_the_plane(tmp_path: Path) -> None:
     np.testing.assert_allclose(terrain.height_m(points), [plane_m(*point) for point in points], atol=1e-6)
     assert np.isnan(terrain.height_m(np.array([[45.0, 45.0]]))).all(), "outside the window"
     assert "ground.gml: terrain of " in terrain.notes[0]
-
-
-def test_file_is_solids_or_terrain(tmp_path: Path) -> None:
-    assert isinstance(citygml_relief, TerrainReader)
-    files = {
-        "ground.gml": write_model(tmp_path / "ground.gml", relief(1)),
-        "53392640_dem_6697_op.gml": write_model(tmp_path / "53392640_dem_6697_op.gml", house("h", 0, 0)),
-        "houses.gml": write_model(tmp_path / "houses.gml", house("h", 0, 0)),
-    }
-    heads = {name: path.read_bytes()[:4096] for name, path in files.items()}
-    assert [citygml_relief.can_open(files[name], heads[name]) for name in files] == [True, True, False]
-    assert [citygml.can_open(files[name], heads[name]) for name in files] == [False, False, True]
 
 
 def test_tiles_out_of_reach_are_not_opened(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 import shapely
 
 from egvs.core.errors import InputError
-from egvs.creation.map_parts import DEFAULT_BUILDING_M, Alignment, MapContext, SolidReader
+from egvs.creation.map_parts import DEFAULT_BUILDING_M, Alignment, MapContext
 from egvs.extensions.maps.buildings import footprint_maps
 from egvs.formats.georeference import WorldFrame
 
@@ -38,14 +38,6 @@ def write(path: Path, *features: Any, **members: object) -> Path:
 
 def read(path: Path, context: MapContext = CONTEXT) -> footprint_maps.SolidMap:
     return footprint_maps.read_solids([path], context)
-
-
-def test_is_a_reader() -> None:
-    assert isinstance(footprint_maps, SolidReader)
-    for name in ("a.geojson", "a.GPKG", "a.shp", "a.parquet"):
-        assert footprint_maps.can_open(Path(name), b"")
-    assert footprint_maps.can_open(Path("a.json"), b'{"type": "FeatureCollection"')
-    assert not footprint_maps.can_open(Path("a.json"), b'{"type": "CityJSON"')
 
 
 def test_degrees_without_declaration_are_wgs84(tmp_path: Path) -> None:

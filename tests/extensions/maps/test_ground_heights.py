@@ -13,7 +13,7 @@ from shapely.geometry import box
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.creation.alignment import check_used
-from egvs.creation.map_parts import Alignment, MapContext, TerrainReader
+from egvs.creation.map_parts import Alignment, MapContext
 from egvs.creation.terrain.ground_heights import CombinedTerrain, TinTerrain, ground_points, tin_terrain
 from egvs.extensions.maps.terrain import landxml as landxml_terrain
 from egvs.extensions.maps.terrain import rasters
@@ -24,15 +24,6 @@ from tests.extensions.maps.formats.test_rasters import EAST, NORTH, plane_cells,
 FRAME = WorldFrame("EPSG:32632", (-EAST, -NORTH))
 WINDOW = box(0, 0, 120, 80)
 CONTEXT = MapContext(FRAME, WINDOW)
-
-
-def test_readers_know_their_files() -> None:
-    assert isinstance(rasters, TerrainReader) and isinstance(landxml_terrain, TerrainReader)
-    assert rasters.can_open(Path("a.tif"), b"II*\x00") and rasters.can_open(Path("a.asc.gz"), b"ncols 2")
-    assert not rasters.can_open(Path("a.xml"), b"<LandXML>")
-    assert landxml_terrain.can_open(Path("a.xml"), b"<LandXML>") and not landxml_terrain.can_open(
-        Path("a.xml"), b"<osm>"
-    )
 
 
 def test_raster_in_the_projection_of_the_network(tmp_path: Path) -> None:

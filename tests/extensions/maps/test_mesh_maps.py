@@ -10,7 +10,7 @@ import shapely
 import trimesh
 
 from egvs.core.errors import InputError
-from egvs.creation.map_parts import Alignment, MapContext, SolidReader
+from egvs.creation.map_parts import Alignment, MapContext
 from egvs.extensions.maps.buildings import mesh_maps
 
 QUARTER_TURN = Alignment(np.array([[0.0, 0.0], [10.0, 0.0]]), np.array([[100.0, 50.0], [100.0, 60.0]]))
@@ -22,15 +22,6 @@ CONTEXT = MapContext(None, shapely.box(0, 0, 200, 200), QUARTER_TURN)
 def block(x_m: float, y_m: float) -> trimesh.Trimesh:
     """A block of 4 m along x, 2 m along y, from the ground to 6 m."""
     return trimesh.creation.box((4, 2, 6), trimesh.transformations.translation_matrix((x_m + 2, y_m + 1, 3)))
-
-
-def test_is_a_reader() -> None:
-    assert isinstance(mesh_maps, SolidReader)
-    for name in ("a.obj", "a.GLB", "a.gltf", "a.stl"):
-        assert mesh_maps.can_open(Path(name), b"")
-    assert mesh_maps.can_open(Path("a.ply"), b"ply\nelement vertex 8\nelement face 12\n")
-    assert not mesh_maps.can_open(Path("a.ply"), b"ply\nelement vertex 8\n")
-    assert not mesh_maps.can_open(Path("a.osm"), b"")
 
 
 @pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "glb"])

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from egvs.core.errors import InputError
-from egvs.creation.map_parts import RoadMap, RoadOptions, RoadReader
+from egvs.creation.map_parts import RoadMap, RoadOptions
 from egvs.extensions.maps.formats.opendrive import read_opendrive
 from egvs.extensions.maps.opendrive import reader as opendrive
 from egvs.extensions.maps.opendrive.check import compare_with_map, read_made_network
@@ -67,14 +67,6 @@ def frame_of(roads: Network) -> WorldFrame | None:
 
 def lanes(roads: Network) -> dict[str, network.Lane]:
     return {f"{edge.id}_{index}": lane for edge in roads.edges for index, lane in enumerate(edge.lanes)}
-
-
-def test_recognises_name_and_root_element() -> None:
-    assert isinstance(opendrive, RoadReader) and opendrive.NAME == "OpenDRIVE"
-    for name in ("a.xodr", "a.XODR.gz"):
-        assert opendrive.can_open(Path(name), b"")
-    assert opendrive.can_open(Path("a.xml"), b'<?xml version="1.0"?>\n<OpenDRIVE>')
-    assert not opendrive.can_open(Path("a.osm"), b"<osm>")
 
 
 @pytest.mark.system

@@ -13,11 +13,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from egvs.core import limits, plugins
+from egvs.core import limits, readers
 from egvs.core.errors import InputError
+from egvs.core.readers import HEAD_BYTES
 from egvs.extensions.tracks import sources as track_readers
 from egvs.extensions.tracks.formats import argoverse2, dair_v2x, openlabel, osi, v2x_seq_tfd
-from egvs.extensions.tracks.model import HEAD_BYTES
 from tests.extensions.tracks import writers_json
 from tests.extensions.tracks.boxes import moving_boxes
 from tests.extensions.tracks.writers import TrackRows
@@ -75,9 +75,9 @@ def test_one_reader_accepts_file(tmp_path: Path, kind: str) -> None:
         pytest.importorskip("osi3", reason="osi-python is not installed (egvs[osi])")
     path = write(tmp_path, moving_boxes(("car", "pedestrian"), 10))
     head = path.read_bytes()[:HEAD_BYTES]
-    names = plugins.plugin_names(track_readers.GROUP)
-    readers = [plugins.load_plugin(track_readers.GROUP, name) for name in names]
-    assert [other for other in readers if other.can_open(path, head)] == [reader]
+    assert track_readers.find_reader(path) is reader
+    modules = [readers.load_reader(other) for other in readers.list_readers(track_readers.KIND)]
+    assert [other for other in modules if other.can_open(path, head)] == [reader]
 
 
 @pytest.fixture(autouse=True)

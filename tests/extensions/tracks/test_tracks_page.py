@@ -7,7 +7,7 @@ import re
 import tomllib
 from pathlib import Path
 
-from egvs.core import plugins
+from egvs.core import readers
 from egvs.extensions.tracks import sources as track_readers
 from egvs.extensions.tracks import user_table
 from egvs.extensions.tracks.model import TrackFrame
@@ -30,8 +30,7 @@ def test_mapping_of_the_page(tmp_path: Path) -> None:
 
 
 def test_page_names_all_formats_and_keys() -> None:
-    for name in plugins.plugin_names(track_readers.GROUP):
-        reader = plugins.load_plugin(track_readers.GROUP, name)
-        assert all(word in PAGE for word in re.findall(r"[\w-]{3,}", reader.NAME)), name
+    for reader in readers.list_readers(track_readers.KIND):
+        assert all(word in PAGE for word in re.findall(r"[\w-]{3,}", reader.name)), reader.name
     for key in TrackColumns.model_fields:
         assert f"`{key}`" in PAGE, key

@@ -1,1 +1,3 @@
 """Extracts of OpenStreetMap: streets, and what stands beside them."""
+
+ATTRIBUTION = "(c) OpenStreetMap contributors, ODbL"

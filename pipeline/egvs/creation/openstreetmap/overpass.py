@@ -33,8 +33,8 @@ from egvs.core.errors import InputError
 from egvs.core.files import atomic_write, temporary_folder
 from egvs.core.limits import DOWNLOAD, DOWNLOAD_TIME
 from egvs.creation import junctions
+from egvs.creation.openstreetmap import ATTRIBUTION
 from egvs.creation.openstreetmap import reader as openstreetmap
-from egvs.creation.openstreetmap.street_network import ATTRIBUTION
 from egvs.creation.scenario_files import SENSOR
 from egvs.formats import osm, xml
 from egvs.formats.osm import Bounds
@@ -304,7 +304,7 @@ def _check_answer(path: Path, where: object) -> str:
     """Return the time of the map data; InputError unless a file is a complete extract."""
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
-    if not openstreetmap.is_osm_xml(head):
+    if re.search(rb"<osm[\s>]", head) is None:
         text = " ".join(re.sub(rb"<[^>]*>", b" ", head).decode("utf-8", "replace").split())
         quoted = f": {text[:200]!r}" if text else ""
         raise InputError(where, f"expected OpenStreetMap data, got another answer{quoted}", _OTHER_SERVER)

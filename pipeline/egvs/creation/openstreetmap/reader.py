@@ -8,7 +8,6 @@ bridge decks and poles become solids (:mod:`egvs.creation.openstreetmap.solids`)
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,32 +17,18 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core.errors import InputError
 from egvs.creation import junctions, road_levels
 from egvs.creation.junctions import StreetJunction, Streets
-from egvs.creation.map_parts import ImportCounts, MapContext, MappedSolid, RoadMap, RoadOptions, SolidMap
-from egvs.creation.openstreetmap import elevation
+from egvs.creation.map_parts import ImportCounts, MapContext, MappedSolid, RoadOptions, SolidMap
+from egvs.creation.openstreetmap import ATTRIBUTION, elevation
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
-from egvs.creation.openstreetmap.street_network import ATTRIBUTION
 from egvs.creation.road_levels import OtherLevels
 from egvs.formats import osm as osm_files
 from egvs.formats.osm import OsmExtract
-
-NAME = "OpenStreetMap"
 
 SURROUNDINGS_M = 300.0
 """How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
 
 _ONE_LEVEL = OtherLevels()
-_SUFFIXES = (".osm", ".osm.xml", ".osm.pbf", ".pbf")
-
-
-def can_open(path: Path, head: bytes) -> bool:
-    """Return whether a file is named as an OpenStreetMap extract, or begins as one."""
-    return path.name.lower().removesuffix(".gz").endswith(_SUFFIXES) or is_osm_xml(head)
-
-
-def is_osm_xml(head: bytes) -> bool:
-    """Return whether a file begins with an element ``<osm>``; the comment of a SUMO network may name ``<osm-files``."""
-    return re.search(rb"<osm[\s>]", head) is not None
 
 
 def check_inside_extract(extract: OsmExtract, at: tuple[float, float] | None, option: str = "--at") -> None:
@@ -84,7 +69,7 @@ class OsmRoads:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def read(cls, path: Path, options: RoadOptions, at: tuple[float, float] | None = None) -> OsmRoads:
+    def read(cls, path: Path, options: RoadOptions) -> OsmRoads:
         """Read an extract and build the network of all its streets.
 
         Parameters
@@ -92,17 +77,15 @@ class OsmRoads:
         path
             XML (plain or gzipped) or PBF.
         options
-            Side of the road, and whether there are sidewalks.
-        at
-            Latitude, longitude in degrees, which must be inside the extract.
+            ``at`` must be inside the extract.
 
         Raises
         ------
         InputError
-            When the file is damaged or has no drivable streets, or ``at`` is outside.
+            When the file is damaged or has no drivable streets, or the position is outside.
         """
         extract = osm_files.read_osm(path)
-        check_inside_extract(extract, at)
+        check_inside_extract(extract, options.at)
         flags = osm_network.netconvert_flags(extract, lefthand=options.lefthand, walk=options.walk)
         notes: tuple[str, ...] = ()
         if options.has_terrain:
@@ -116,6 +99,19 @@ class OsmRoads:
                 flags += elevation.ELEVATION_FLAGS
         network, streets = osm_network.build_network(extract, path, flags)
         return cls(extract, path, tuple(flags), network, streets, notes=notes)
+
+    @property
+    def keeps_heights(self) -> bool:
+        """False: heights of the map (``ele``) count from sea level."""
+        return False
+
+    @property
+    def level_notes(self) -> tuple[str, ...]:
+        """A sentence about roads on other levels, if there are any."""
+        if not self.others.roads:
+            return ()
+        titles = ", ".join(self.others.road_titles)
+        return (f"Roads on another level are left out of the traffic in the region of interest: {titles}.",)
 
     def on_level_of(self, junction: StreetJunction) -> OsmRoads:
         """Return the roads without those that cross a junction's region on another level."""
@@ -141,14 +137,15 @@ class OsmRoads:
         """Return the levels of the edges that are not on the ground: bridges and tunnels."""
         return road_levels.edge_levels((edge.id for edge in self.streets.network.edges), self.extract)
 
-    def solids(self, window: BaseGeometry) -> tuple[list[MappedSolid], ImportCounts]:
-        """Return the static objects in a window (world frame, metres), and what happened to the others."""
-        return osm_solids.map_solids(self.extract, self.streets, self.others.decks, window)
+    def solids(self, window: BaseGeometry) -> SolidMap:
+        """Return the static objects in a window (world frame, metres), bridges over the junction included."""
+        solids, counts = osm_solids.map_solids(self.extract, self.streets, self.others.decks, window)
+        return SolidMap(tuple(solids), counts=counts, attribution=ATTRIBUTION, is_base=True)
 
 
-def read_roads(path: Path, options: RoadOptions) -> RoadMap:
-    """Return the network of all streets of an extract; InputError when it is damaged or has no drivable streets."""
-    return RoadMap(OsmRoads.read(path, options).network, ATTRIBUTION)
+def open_roads(path: Path, options: RoadOptions) -> OsmRoads:
+    """Return the roads of an extract; InputError when it is damaged or has no drivable streets."""
+    return OsmRoads.read(path, options)
 
 
 def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
@@ -165,4 +162,4 @@ def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
         )  # fmt: skip
         solids += of_file
         counts = counts.plus(counts_of_file)
-    return SolidMap(tuple(solids), counts=counts, attribution=ATTRIBUTION)
+    return SolidMap(tuple(solids), counts=counts, attribution=ATTRIBUTION, is_base=True)

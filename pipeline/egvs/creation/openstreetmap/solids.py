@@ -28,6 +28,7 @@ from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY
+from egvs.creation.carriageway import clear_of_carriageway, geometry_pieces, lanes_under, large_pieces
 from egvs.creation.junctions import Streets
 from egvs.creation.map_parts import DECK_BASE_M, DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedSolid
 from egvs.creation.openstreetmap.street_network import PATH_HIGHWAYS
@@ -51,11 +52,6 @@ _SOLID_TYPES = SolidTypes()
 _BUILDING_KEYS = ("building:part", "building", "man_made")
 
 _MAX_LANES = 12
-
-_GRID_M = 0.001
-_SLIVER_M2 = 0.25
-_SHORT_M = 0.1
-_MARGIN_M = 0.01
 
 
 def map_solids(
@@ -96,7 +92,7 @@ def map_solids(
         if _is_outside(crown, window):
             counts.drop("tree", OUT_OF_RANGE)
             continue
-        if _lanes_under(trunk, lanes):
+        if lanes_under(trunk, lanes):
             counts.drop("tree", "on_carriageway")
             continue
         counts.keep(trunk)
@@ -109,47 +105,10 @@ def _is_outside(solid: MappedSolid, window: BaseGeometry | None) -> bool:
     return window is not None and not window.intersects(solid.area)
 
 
-def _lanes_under(solid: MappedSolid, lanes: shapely.STRtree) -> list[BaseGeometry]:
-    """Return the pieces of carriageway that a solid covers or touches."""
-    return list(lanes.geometries[sorted(lanes.query(solid.area, predicate="dwithin", distance=_MARGIN_M))])
-
-
-def clear_of_carriageway(solid: MappedSolid, lanes: shapely.STRtree, counts: ImportCounts) -> list[MappedSolid]:
-    """Return the parts of an object outside the carriageway, one solid for each part; the object is counted."""
-    covered_lanes = _lanes_under(solid, lanes)
-    if solid.base_m >= CLEARANCE_M or not covered_lanes:
-        pieces = geometry_pieces(solid.geometry)
-    else:
-        pieces = _cut_away(solid, covered_lanes, counts)
-        if not pieces:
-            counts.drop(solid.kind, "on_carriageway")
-            return []
-        counts.cut[solid.kind] += 1
-
-    counts.keep(solid)
-    if len(pieces) == 1:
-        return [dataclasses.replace(solid, geometry=pieces[0])]
-    solids = []
-    for number, piece in enumerate(pieces, 1):
-        solids.append(dataclasses.replace(solid, geometry=piece, name=f"{solid.name}#{number}"))
-    return solids
-
-
-def _cut_away(solid: MappedSolid, lanes: list[BaseGeometry], counts: ImportCounts) -> list[BaseGeometry]:
-    """Cut the lanes out of a solid; a point on a lane vanishes."""
-    if isinstance(solid.geometry, Point):
-        return []
-    clearance_m = _MARGIN_M + 1.5 * (solid.radius_m or 0.0)  # the width of a line must stay clear too
-    rest = solid.geometry.difference(shapely.union_all(lanes).buffer(clearance_m))
-    pieces, slivers = large_pieces(rest)
-    counts.slivers += slivers
-    return pieces
-
-
 def _above_traffic(crown: MappedSolid, lanes: shapely.STRtree, counts: ImportCounts) -> MappedSolid:
     """Lift the underside of a crown that overhangs the carriageway, as far as the height of the tree allows."""
     lifted_m = min(CLEARANCE_M, 0.8 * crown.height_m)
-    if lifted_m <= crown.base_m or not _lanes_under(crown, lanes):
+    if lifted_m <= crown.base_m or not lanes_under(crown, lanes):
         return crown
     counts.raised_crowns += 1
     return dataclasses.replace(crown, base_m=lifted_m)
@@ -175,34 +134,6 @@ def tag_value(tags: Tags, key: str, parse: Callable[[str], float | None], counts
 def point_at(xy: XY) -> Point:
     """Return a point, rounded to millimetres."""
     return Point(round(xy[0], 3), round(xy[1], 3))
-
-
-def geometry_pieces(geometry: BaseGeometry) -> list[BaseGeometry]:
-    """Split a geometry into its polygons or, without any, its lines or points, in an order that depends on position."""
-    parts = []
-    for member in shapely.get_parts(geometry):
-        parts += [part for part in shapely.get_parts(member) if not part.is_empty]
-    polygons = []
-    lines = []
-    for part in parts:
-        if isinstance(part, Polygon):
-            polygons.append(shapely.geometry.polygon.orient(shapely.normalize(part)))
-        elif isinstance(part, LineString):
-            lines.append(part)
-    return sorted(polygons or lines or parts, key=lambda piece: (piece.bounds, piece.wkb))
-
-
-def large_pieces(geometry: BaseGeometry) -> tuple[list[BaseGeometry], int]:
-    """Split a geometry, in millimetres, into polygons or else lines; also return how many slivers were dropped."""
-    pieces = geometry_pieces(shapely.set_precision(geometry, _GRID_M))
-    large = [piece for piece in pieces if not _is_sliver(piece)]
-    return large, len(pieces) - len(large)
-
-
-def _is_sliver(piece: BaseGeometry) -> bool:
-    if isinstance(piece, Polygon):
-        return bool(piece.area < _SLIVER_M2)
-    return bool(piece.length < _SHORT_M)
 
 
 def way_lines(way: Way, xy: dict[int, XY]) -> list[LineString]:

@@ -28,13 +28,12 @@ from egvs.core.errors import InputError, RunError
 from egvs.core.grid import XY
 from egvs.creation import junctions
 from egvs.creation.junctions import StreetJunction, Streets
+from egvs.creation.openstreetmap import ATTRIBUTION
+from egvs.creation.plain_network import NETWORK_FILE
 from egvs.formats import xml
 from egvs.formats.osm import OsmExtract, Way, parse_number, write_streets
 from egvs.traffic import sumo, sumo_folder
 from egvs.traffic.network import Location
-
-ATTRIBUTION = "(c) OpenStreetMap contributors, ODbL"
-NETWORK_FILE = "network.net.xml"
 
 NETCONVERT_FLAGS = (
     "--geometry.remove", "--junctions.join", *sumo_folder.OSM_SIGNALS,

@@ -17,11 +17,9 @@ from pathlib import Path
 import numpy as np
 from shapely.geometry import box
 
-from egvs.creation import sumo_network
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.creation.map_parts import MapContext, MappedMesh, RoadMap, Terrain
 from egvs.creation.map_readers import MapFile
-from egvs.creation.openstreetmap.reader import OsmRoads
 from egvs.creation.road_source import NetworkRoads, RoadSource
 from egvs.creation.terrain import draping, network_heights, relief
 from egvs.creation.terrain.ground_heights import CombinedTerrain, ExtendedTerrain, TinTerrain
@@ -44,9 +42,9 @@ def read_terrain(files: Sequence[MapFile], context: MapContext) -> Terrain | Non
     """Return the ground of all terrain files; None without any; InputError when a file is damaged."""
     by_reader: dict[str, list[MapFile]] = {}
     for file in files:
-        by_reader.setdefault(file.reader.NAME, []).append(file)
+        by_reader.setdefault(file.reader.name, []).append(file)
     terrains = tuple(
-        group[0].reader.read_terrain(tuple(file.path for file in group), context) for group in by_reader.values()
+        group[0].module.read_terrain(tuple(file.path for file in group), context) for group in by_reader.values()
     )
     if not terrains:
         return None
@@ -80,7 +78,7 @@ def find_zero(
     roads, file
         The roads, and their map.
     junction
-        z = 0 is its ground, unless the road map is a SUMO network, whose heights are used as they are.
+        z = 0 is its ground, unless the road map keeps its heights.
     terrain
         The ground; None without a terrain.
     terrain_files
@@ -93,7 +91,7 @@ def find_zero(
     """
     has_heights = roads.streets.network.has_heights
     road_height_m = 0.0
-    if has_heights and file.reader is not sumo_network:
+    if has_heights and not roads.keeps_heights:
         road_height_m = round(float(np.median(relief.lane_heights_near(roads.streets, junction))), 3)
     if terrain is None:
         return ZeroHeight(road_height_m if has_heights else None)
@@ -133,7 +131,7 @@ def lay_on_ground(
         When the terrain has no height at a road.
     """
     if roads.streets.network.has_heights:
-        if file.reader is sumo_network:
+        if roads.keeps_heights:
             return roads
         zero_m = find_zero(roads, file, junction, None).height_m
         if not zero_m:
@@ -142,8 +140,8 @@ def lay_on_ground(
         return _with_network(roads, network_heights.shift_heights(roads.network, -zero_m), (note,), file.path)
     if terrain is None:
         return roads
-    levels = roads.edge_levels() if isinstance(roads, OsmRoads) else {}
-    draped = draping.drape_network(roads.network, terrain, junction.at_m, levels, _names(terrain_files) or file.path)
+    where = _names(terrain_files) or file.path
+    draped = draping.drape_network(roads.network, terrain, junction.at_m, roads.edge_levels(), where)
     return _with_network(roads, draped.text, draped.notes, file.path)
 
 

@@ -34,10 +34,12 @@ from egvs.creation import assumed_traffic, junctions, new_scenario, scenario_fil
 from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, TRAFFIC_LEVELS
 from egvs.creation.junctions import HEIGHTS_M, JunctionRegion, KerbsidePole, NearbyJunction, StreetJunction, Streets
 from egvs.creation.map_parts import ImportCounts, MappedSolid
+from egvs.creation.openstreetmap import ATTRIBUTION
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
 from egvs.creation.openstreetmap.reader import check_inside_extract
-from egvs.creation.openstreetmap.street_network import ATTRIBUTION, NETWORK_FILE, NetworkExcerpts
+from egvs.creation.openstreetmap.street_network import NetworkExcerpts
+from egvs.creation.plain_network import NETWORK_FILE
 from egvs.creation.scenario_files import PITCHES_DEG, SITES_FILE, STATICS_FILE, TomlTable, reachable_area
 from egvs.extensions.city import model
 from egvs.extensions.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC_FOLDER, CityJunction
@@ -470,7 +472,7 @@ def _city_files(
         near = [solids[i] for i in sorted(areas.query(reachable, predicate="intersects"))]
         roads = excerpts.near(city.streets.near(_surroundings(junction.roi, _ROADS_MARGIN_M)))
         folder = f"{JUNCTIONS_FOLDER}/{junction.id}"
-        yield f"{folder}/{STATICS_FILE}", scenario_files.solids_geojson(near, _count_solids(near))
+        yield f"{folder}/{STATICS_FILE}", scenario_files.solids_geojson(near, _count_solids(near), (ATTRIBUTION,))
         yield f"{folder}/{SITES_FILE}", scenario_files.sites_csv(junction.poles)
         yield f"{folder}/{ROADS_FILE}", roads
         yield f"{folder}/{SCENARIO_FILE}", junction_toml(junction.id, junction.junction.title, junction.roi)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from egvs.cli.console import WIDE, Column, console, make_table
 from egvs.cli.new_summary import describe_dropped, describe_solids, describe_streets
-from egvs.creation.openstreetmap.street_network import ATTRIBUTION
+from egvs.creation.openstreetmap import ATTRIBUTION
 from egvs.extensions.city.creation import IMPORT_FILE, NewCity, NewJunction
 
 

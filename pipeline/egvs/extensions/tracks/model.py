@@ -1,9 +1,9 @@
 """What the readers of recorded tracks return: one box per row, in metres, seconds and radians.
 
-A reader is a module with ``NAME``, ``can_open`` and ``read``, declared as an entry point of the group ``egvs.tracks``.
-It reads columns by name and converts them to :class:`Tracks`: centres of boxes, yaw counter-clockwise from +x. It
-returns rows as they were recorded. Duplicates, gaps, missing sizes and headings, and the frame period are the business
-of :mod:`egvs.extensions.tracks.cleaning` and :mod:`egvs.extensions.tracks.resampling`, which treat all formats alike.
+A reader is a module with ``companions`` and ``read``, in the table of readers (:mod:`egvs.core.readers`). It reads
+columns by name and converts them to :class:`Tracks`: centres of boxes, yaw counter-clockwise from +x. It returns rows
+as they were recorded. Duplicates, gaps, missing sizes and headings, and the frame period are the business of
+:mod:`egvs.extensions.tracks.cleaning` and :mod:`egvs.extensions.tracks.resampling`, which treat all formats alike.
 """
 
 from __future__ import annotations
@@ -18,9 +18,6 @@ from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
 from egvs.scenario.track_columns import RoadUserClass
-
-HEAD_BYTES = 4096
-"""How much of a file :meth:`TrackReader.can_open` gets, after gunzip."""
 
 CLASSES: tuple[str, ...] = get_args(RoadUserClass)
 """Classes of road users."""
@@ -146,16 +143,12 @@ _NUMBERS = ("time_s", "x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "he
 
 
 class TrackReader(Protocol):
-    """A module that reads one format."""
+    """A module that reads one format.
+
+    It may have a function ``can_open(path, head)``, which decides where the table of readers cannot.
+    """
 
     __name__: str
-
-    NAME: str
-    """The format, for messages: "INTERACTION tracks"."""
-
-    def can_open(self, path: Path, head: bytes) -> bool:
-        """Return whether a file has the format; ``head`` are its first :data:`HEAD_BYTES`. Never raises."""
-        ...
 
     def companions(self, path: Path) -> Sequence[Path]:
         """Return the files beside it that :meth:`read` needs, e.g. with sizes and classes; they must exist."""

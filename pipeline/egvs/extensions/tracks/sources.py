@@ -1,34 +1,33 @@
-"""Find the reader of a file of recorded tracks: entry points of the group ``egvs.tracks``."""
+"""Find the reader of a file of recorded tracks in the table of readers (:mod:`egvs.core.readers`)."""
 
 from __future__ import annotations
 
-import gzip
-import zlib
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
-from egvs.core import plugins
-from egvs.core.digests import open_input
+from egvs.core import readers
 from egvs.core.errors import InputError
 from egvs.extensions.tracks import user_table
-from egvs.extensions.tracks.model import HEAD_BYTES, TrackReader, Tracks
+from egvs.extensions.tracks.model import TrackReader, Tracks
 from egvs.scenario.track_columns import TrackColumns
 
-GROUP = "egvs.tracks"
-
-_GZIP = b"\x1f\x8b"
+KIND = "tracks"
+"""Kind of the readers of tracks."""
 
 
 def find_reader(path: Path) -> TrackReader:
-    """Return the reader of a file, the first in the order of names that accepts it.
+    """Return the module that reads a file.
 
     Raises
     ------
     InputError
         When the file does not exist, or no reader accepts it.
+    MissingBackendError
+        When its reader cannot be used.
     """
     reader = _find(path)
     if reader is None:
@@ -46,12 +45,11 @@ def _format_hint() -> str:
 
 
 def _find(path: Path) -> TrackReader | None:
-    head = _read_head(path)
-    for name in plugins.plugin_names(GROUP):
-        reader: TrackReader = plugins.load_plugin(GROUP, name)
-        if reader.can_open(path, head):
-            return reader
-    return None
+    reader = readers.find_reader(KIND, path)
+    if reader is None:
+        return None
+    module = readers.load_reader(reader, ("companions", "read"), f"a module as described in {TrackReader.__module__}")
+    return cast(TrackReader, module)
 
 
 @dataclass(frozen=True)
@@ -114,19 +112,4 @@ def _read_file(path: Path, _modified_ns: tuple[int, ...], columns: str | None) -
 
 def describe_formats() -> str:
     """Return the names of the formats that can be read."""
-    return ", ".join(plugins.load_plugin(GROUP, name).NAME for name in plugins.plugin_names(GROUP))
-
-
-def _read_head(path: Path) -> bytes:
-    """Return the first bytes of a file, after gunzip where possible."""
-    if not path.is_file():
-        raise InputError(path, "no such file", "Check the path.")
-    with open_input(path) as content:
-        head: bytes = content.read(HEAD_BYTES)
-    if not head.startswith(_GZIP):
-        return head
-    try:
-        with open_input(path) as content, gzip.open(content) as unzipped:
-            return unzipped.read(HEAD_BYTES)
-    except (EOFError, OSError, zlib.error):  # damaged: its reader says so
-        return head
+    return readers.describe_formats(KIND)

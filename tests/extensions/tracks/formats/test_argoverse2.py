@@ -14,8 +14,9 @@ from pyarrow import feather, parquet
 
 from egvs.core import limits
 from egvs.core.errors import InputError
+from egvs.core.readers import HEAD_BYTES
 from egvs.extensions.tracks.formats import argoverse2
-from egvs.extensions.tracks.model import HEAD_BYTES, TrackFrame
+from egvs.extensions.tracks.model import TrackFrame
 from tests.extensions.tracks.boxes import assert_same_boxes, moving_boxes
 from tests.extensions.tracks.writers_json import CLASSES, write_argoverse2, write_argoverse2_scenario
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from egvs.core.errors import InputError
+from egvs.core.readers import HEAD_BYTES
 from egvs.extensions.tracks.formats import dair_v2x
-from egvs.extensions.tracks.model import HEAD_BYTES, TrackFrame
+from egvs.extensions.tracks.model import TrackFrame
 from tests.extensions.tracks.boxes import assert_same_boxes, moving_boxes
 from tests.extensions.tracks.writers_json import CLASSES, write_dair_v2x
 

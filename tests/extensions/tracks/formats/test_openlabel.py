@@ -17,8 +17,9 @@ import pytest
 
 from egvs.core import limits
 from egvs.core.errors import InputError
+from egvs.core.readers import HEAD_BYTES
 from egvs.extensions.tracks.formats import openlabel
-from egvs.extensions.tracks.model import HEAD_BYTES, TrackFrame
+from egvs.extensions.tracks.model import TrackFrame
 from tests.extensions.tracks.boxes import assert_same_boxes, moving_boxes
 from tests.extensions.tracks.writers_json import CLASSES, SENSOR, write_openlabel, write_tumtraf
 

@@ -14,8 +14,9 @@ import pytest
 
 from egvs.core import limits, plugins
 from egvs.core.errors import InputError, MissingExtraError
+from egvs.core.readers import HEAD_BYTES
 from egvs.extensions.tracks.formats import osi
-from egvs.extensions.tracks.model import HEAD_BYTES, TrackFrame
+from egvs.extensions.tracks.model import TrackFrame
 from tests.extensions.tracks.boxes import assert_same_boxes, moving_boxes
 from tests.extensions.tracks.writers_json import CLASSES, write_osi, write_osi_mcap
 

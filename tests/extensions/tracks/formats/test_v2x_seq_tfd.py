@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from egvs.core.errors import InputError
+from egvs.core.readers import HEAD_BYTES
 from egvs.extensions.tracks.formats import v2x_seq_tfd
-from egvs.extensions.tracks.model import HEAD_BYTES, TrackFrame
+from egvs.extensions.tracks.model import TrackFrame
 from tests.extensions.tracks.boxes import assert_same_boxes, moving_boxes
 from tests.extensions.tracks.writers_json import CLASSES, TFD_COLUMNS, write_v2x_seq_tfd
 

@@ -18,14 +18,14 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from egvs.core import files, limits
+from egvs.core import files, limits, readers
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
-from egvs.extensions.hardware.recordings import ros_bags, velodyne_pcap
 from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
 from egvs.extensions.hardware.recordings.recordings import RecordedSweep, Recording
 from egvs.formats import point_clouds
@@ -92,11 +92,9 @@ def read_sweeps(paths: Sequence[str | Path], options: RecordingOptions | None = 
     sweeps: list[Sweep] = []
     options = options or RecordingOptions()
     for path in map(Path, paths):
-        if ros_bags.is_recording(path):
-            sweeps += _recorded(*ros_bags.read(path, path.name, options))
-            continue
-        if path.suffix.lower() in velodyne_pcap.SUFFIXES:
-            sweeps += _recorded(*velodyne_pcap.read(path, path.name, options))
+        reader = _recording_reader(path)
+        if reader is not None:
+            sweeps += _recorded(*reader.read(path, path.name, options))
             continue
         limits.checked_size(path, limits.FILE)
         if path.suffix.lower() == ".gz":
@@ -112,6 +110,15 @@ def read_sweeps(paths: Sequence[str | Path], options: RecordingOptions | None = 
             problem = f"expected a sweep of at least {MIN_RETURNS:,} returns, got {sweep.returns:,}"
             raise InputError(sweep.name, problem, "Give complete sweeps, one per file.")
     return sweeps
+
+
+def _recording_reader(path: Path) -> Any:
+    """Return the module that reads a recording; None for other files. Its folder stands for a recording of ROS 2."""
+    index = path / "metadata.yaml"
+    for reader in readers.list_readers("sweeps"):
+        if reader.may_open(index if index.is_file() else path, b""):
+            return readers.load_reader(reader, ("read",), "a module with a function read(path, where, options)")
+    return None
 
 
 def _recorded(recording: Recording, recorded: list[RecordedSweep]) -> Iterator[Sweep]:

@@ -30,19 +30,12 @@ from egvs.extensions.hardware.recordings.recordings import (
 )
 from egvs.formats.reader_process import Block, serve
 
-SUFFIXES = (".bag", ".mcap", ".db3")
-
 _CANNOT_READ = "cannot be read as a recording of ROS"
 _TYPE = "sensor_msgs/msg/PointCloud2"
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy types by the datatype of a sensor_msgs/PointField."""
 _TIME_FIELDS = ("time", "timestamp", "t", "offset_time", "time_stamp")
 _NANO = 1e-9
-
-
-def is_recording(path: Path) -> bool:
-    """Return whether a path is a recording of ROS, by its suffix, or because it is a folder of ROS 2."""
-    return path.suffix.lower() in SUFFIXES or (path / "metadata.yaml").is_file()
 
 
 def read(path: Path, where: str, options: RecordingOptions) -> tuple[Recording, list[RecordedSweep]]:

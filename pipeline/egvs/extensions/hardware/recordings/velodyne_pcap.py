@@ -31,8 +31,6 @@ from egvs.extensions.hardware.recordings.recordings import (
 )
 from egvs.formats.reader_process import Block, serve
 
-SUFFIXES = (".pcap",)
-
 _CANNOT_READ = "cannot be read as a capture of a Velodyne sensor"
 _TIME, _COLUMN, _RING = 4, 5, 6
 """Columns of the decoder's points."""

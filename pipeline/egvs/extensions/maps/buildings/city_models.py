@@ -25,6 +25,7 @@ from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import by_number, list_first, number_of
+from egvs.creation.carriageway import geometry_pieces
 from egvs.creation.map_parts import (
     DEFAULT_BUILDING_M,
     OUT_OF_RANGE,
@@ -34,7 +35,6 @@ from egvs.creation.map_parts import (
     MappedSolid,
     SolidMap,
 )
-from egvs.creation.openstreetmap.solids import geometry_pieces
 from egvs.extensions.maps.formats.city_objects import (
     CityObject,
     Placement,

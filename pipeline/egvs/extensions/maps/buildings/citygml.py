@@ -20,20 +20,11 @@ from egvs.extensions.maps.formats import citygml
 from egvs.extensions.maps.formats.citygml import CityGmlFile
 from egvs.extensions.maps.formats.mesh_codes import TileName, parse_tile_name
 
-NAME = "CityGML"
-
 TILE_KINDS = frozenset({"bldg", "brid", "cons", "frn", "veg"})
 """Kinds of PLATEAU's tiles with solids, in the names of files."""
 
 TILE_MARGIN_M = 200.0
 """How far objects may reach beyond the square of their tile."""
-
-
-def can_open(path: Path, head: bytes) -> bool:
-    """Return whether a file is a city model without terrain, or a folder has ``.gml`` files."""
-    if path.is_dir():
-        return any(_folder_files(path))
-    return citygml.is_citygml(head) and not is_relief(path, head)
 
 
 def is_relief(path: Path, head: bytes) -> bool:

@@ -7,15 +7,7 @@ from pathlib import Path
 
 from egvs.creation.map_parts import MapContext, SolidMap
 from egvs.extensions.maps.buildings.city_models import collect_solids
-from egvs.extensions.maps.formats import cityjson
 from egvs.extensions.maps.formats.cityjson import CityJsonFile
-
-NAME = "CityJSON"
-
-
-def can_open(path: Path, head: bytes) -> bool:
-    """Return whether a file is CityJSON."""
-    return cityjson.is_cityjson(path, head)
 
 
 def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:

@@ -11,7 +11,6 @@ an unknown frame, and needs an alignment.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,14 +22,12 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.reading import read_json, translate_errors
+from egvs.creation.carriageway import geometry_pieces
 from egvs.creation.map_parts import DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MapContext, MappedSolid, SolidMap
-from egvs.creation.openstreetmap.solids import geometry_pieces
 from egvs.formats import vector_files
 from egvs.formats.georeference import WGS84, WORLD, declared_crs
 from egvs.formats.osm import parse_length_m, parse_number
 from egvs.world.map_features import LEVEL_M
-
-NAME = "building footprints"
 
 HEIGHT_COLUMNS = ("height_m", "height", "measuredheight", "measured_height", "building_height", "bldg_height")
 LEVEL_COLUMNS = (
@@ -39,16 +36,8 @@ LEVEL_COLUMNS = (
 BASE_COLUMNS = ("base_m", "min_height")
 NAME_COLUMNS = ("name", "id", "gml_id", "osm_id", "fid")
 
-_SUFFIXES = {".geojson", *vector_files.GIS_FORMATS}
-_COLLECTION = re.compile(rb'"FeatureCollection"')
 _MAX_LEVELS = 200.0
 _HINT = "Use a GeoJSON FeatureCollection of polygons."
-
-
-def can_open(path: Path, head: bytes) -> bool:
-    """Return whether a file has features of a GIS."""
-    suffix = path.suffix.lower()
-    return suffix in _SUFFIXES or (suffix == ".json" and _COLLECTION.search(head) is not None)
 
 
 def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:

@@ -27,8 +27,6 @@ from egvs.scenario.fields import MAX_COORDINATE_M
 if TYPE_CHECKING:
     import trimesh
 
-NAME = "triangle mesh"
-
 _KIND = "mesh"
 _Y_UP = (".gltf", ".glb")
 

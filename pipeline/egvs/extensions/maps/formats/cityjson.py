@@ -33,16 +33,10 @@ from egvs.extensions.maps.formats.city_objects import (
 )
 from egvs.extensions.maps.formats.citygml import valid_height_m, valid_storeys
 
-_TYPE = re.compile(rb'"type"\s*:\s*"CityJSON"')
 _SURFACES = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2, "CompositeSolid": 2}
 """How many levels the boundaries of a geometry have above the list of its surfaces."""
 
 _HINT = "Use a complete CityJSON file of version 1.0, 1.1 or 2.0."
-
-
-def is_cityjson(path: Path, head: bytes) -> bool:
-    """Return whether the beginning of a file is that of a CityJSON file."""
-    return _TYPE.search(head) is not None or path.name.lower().endswith(".city.json")
 
 
 class CityJsonFile:

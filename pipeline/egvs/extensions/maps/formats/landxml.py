@@ -64,11 +64,6 @@ class LandXmlFile:
     hidden_faces: int
 
 
-def is_landxml(head: bytes) -> bool:
-    """Return whether the beginning of a file, decompressed, has the root element of LandXML."""
-    return f"<{ROOT}".encode() in head or f":{ROOT}".encode() in head
-
-
 def read_landxml(path: Path) -> LandXmlFile:
     """Read the surfaces of a LandXML file, gzipped or not.
 

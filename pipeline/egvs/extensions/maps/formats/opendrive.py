@@ -375,11 +375,6 @@ def read_opendrive(path: Path) -> OpenDriveMap:
     return OpenDriveMap(reference, offset_m, offset_rad, roads, junctions)
 
 
-def is_opendrive(head: bytes) -> bool:
-    """Return whether the beginning of a file, decompressed, has the root element of an OpenDRIVE map."""
-    return f"<{ROOT}".encode() in head or f":{ROOT}".encode() in head
-
-
 def _check_root(root: Element, path: Path) -> None:
     tag = root.tag.rpartition("}")[2]
     if tag != ROOT:

@@ -40,8 +40,6 @@ from egvs.extensions.maps.opendrive.turns import DRIVING_TYPES, permitted_turns
 from egvs.formats import georeference
 from egvs.traffic import sumo
 
-NAME = "OpenDRIVE"
-
 RESOLUTION_M = 0.5
 """Distance of the points on curves; lanes of CARLA's Town01 are then at most 0.014 m off, and 0.028 m by default."""
 
@@ -58,12 +56,6 @@ _EDGE_PATCH, _CONNECTION_PATCH = "patch.edg.xml", "patch.con.xml"
 _GENERATED = re.compile(r"<!-- generated on .*?-->", re.DOTALL)
 _GEOID = re.compile(r"\+(?:geoidgrids|vunits|vto_meter)=\S+\s*")
 _LISTED = 5
-
-
-def can_open(path: Path, head: bytes) -> bool:
-    """Return whether a file is an OpenDRIVE map, by its name or its root element."""
-    name = path.name.lower().removesuffix(".gz")
-    return name.endswith(".xodr") or opendrive.is_opendrive(head)
 
 
 def read_roads(path: Path, options: RoadOptions) -> RoadMap:

@@ -45,12 +45,12 @@ class AsBuiltMap(SolidMap):
             tuple((mesh.name, mesh.kind) for mesh in self.meshes),
         )
 
-    def unseen_shares(self, sites_m: FloatArray, roi: Roi) -> FloatArray:
+    def unseen_shares(self, sensors_m: FloatArray, roi: Roi) -> FloatArray:
         """Return which share of its view each site has into space that no station saw.
 
         Parameters
         ----------
-        sites_m
+        sensors_m
             Sensors, (n, 3), in the frame of the meshes.
         roi
             The region of interest, in the same frame.
@@ -60,7 +60,7 @@ class AsBuiltMap(SolidMap):
         ndarray of float64
             (n,), see :func:`unseen_shares`.
         """
-        return unseen_shares(self.world(), self.stations_m, sites_m, roi)
+        return unseen_shares(self.world(), self.stations_m, sensors_m, roi)
 
 
 def unseen_shares(world: World, stations_m: FloatArray, sites_m: FloatArray, roi: Roi) -> FloatArray:

@@ -45,9 +45,6 @@ from egvs.formats import point_clouds, xml
 from egvs.formats.georeference import height_unit_m
 from egvs.scenario.fields import MAX_COORDINATE_M
 
-NAME = "point cloud"
-
-
 THIN_CELL_M = 0.075
 """Large scans are thinned to one point in each cube of this size while they are read."""
 

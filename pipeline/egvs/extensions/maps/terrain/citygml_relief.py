@@ -18,8 +18,6 @@ from egvs.extensions.maps.buildings import citygml
 from egvs.extensions.maps.formats.citygml import read_relief
 from egvs.extensions.maps.formats.mesh_codes import parse_tile_name
 
-NAME = "CityGML relief"
-
 _STEPS = 5
 """Points on each side of the window whose coordinates give its bounds in another system."""
 

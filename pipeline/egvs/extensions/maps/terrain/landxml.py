@@ -10,13 +10,6 @@ from egvs.creation.map_parts import MapContext
 from egvs.creation.terrain.ground_heights import CombinedTerrain, combine_tins, tin_terrain
 from egvs.extensions.maps.formats import landxml
 
-NAME = "LandXML"
-
-
-def can_open(path: Path, head: bytes) -> bool:
-    """Return whether a file is LandXML, by its root element."""
-    return landxml.is_landxml(head)
-
 
 def read_terrain(paths: Sequence[Path], context: MapContext) -> CombinedTerrain:
     """Return the ground of all surfaces; where they overlap, of the first.

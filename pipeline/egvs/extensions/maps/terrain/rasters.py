@@ -22,9 +22,6 @@ from egvs.extensions.maps.formats import rasters
 from egvs.extensions.maps.formats.rasters import HeightGrid
 from egvs.formats import xml
 
-NAME = "GeoTIFF or ASCII grid"
-
-_TIFF_SUFFIXES = (".tif", ".tiff")
 _RIM_POINTS = 21
 
 
@@ -55,13 +52,6 @@ class GridTerrain:
                 break
             heights[unknown] = grid.height_m(self.context.from_world(xy_m[unknown], grid.crs, where))
         return heights
-
-
-def can_open(path: Path, head: bytes) -> bool:
-    """Return whether a file is a GeoTIFF or an ASCII grid."""
-    if rasters.is_geotiff(head) or rasters.is_ascii_grid(head):
-        return True
-    return path.name.lower().removesuffix(".gz").endswith((*_TIFF_SUFFIXES, ".asc"))
 
 
 def read_terrain(paths: Sequence[Path], context: MapContext) -> GridTerrain:

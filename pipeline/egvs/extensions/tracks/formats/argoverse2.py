@@ -25,8 +25,6 @@ from egvs.extensions.tracks.boxes import ClassNames, make_tracks, to_rotations, 
 from egvs.extensions.tracks.formats.arrow_tables import ArrowTable, column_names
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 
-NAME = "Argoverse 2"
-
 _STEP_S = 0.1
 _POSES_FILE = "city_SE3_egovehicle.feather"
 

@@ -27,8 +27,6 @@ from egvs.extensions.tracks.boxes import Box, BoxRows, ClassNames, Pose, is_rota
 from egvs.extensions.tracks.formats.documents import Node, read_document
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 
-NAME = "DAIR-V2X or V2X-Seq labels"
-
 _INDEX_FILE = "data_info.json"
 _LABEL_FOLDER, _CALIBRATION_FOLDER = "virtuallidar", "virtuallidar_to_world"
 

@@ -18,8 +18,6 @@ from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.formats import levelx
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 
-NAME = "highD tracks"
-
 _REQUIRED = ("frame", "id", "x", "y", "width", "height")
 _CLASSES = {"car": "car", "truck": "truck"}
 _YAW_RAD = {1.0: math.pi, 2.0: 0.0}

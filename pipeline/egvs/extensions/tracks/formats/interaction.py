@@ -25,8 +25,6 @@ from egvs.core.grid import FloatArray
 from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 
-NAME = "INTERACTION or TAF-BW tracks"
-
 _REQUIRED = ("track_id", "timestamp_ms", "agent_type", "x", "y")
 _OPTIONAL = ("psi_rad", "length", "width", "case_id")
 _META_FILE = "meta_data.csv"

@@ -19,8 +19,6 @@ from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 from egvs.formats.georeference import WorldFrame, utm_epsg
 
-NAME = "inD, rounD, exiD or uniD tracks"
-
 _REQUIRED = ("trackId", "frame", "xCenter", "yCenter", "heading")
 _CLASSES = {
     "car": "car", "van": "van", "truck": "truck", "truck_bus": "truck", "bus": "bus", "trailer": "trailer",

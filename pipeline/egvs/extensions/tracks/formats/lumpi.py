@@ -18,8 +18,6 @@ from egvs.core.errors import InputError
 from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 
-NAME = "LUMPI labels"
-
 _CELLS = (
     "time", "id", "left", "top", "rectangle width", "rectangle height", "score", "class", "visibility",
     "x", "y", "z", "length", "width", "height", "heading",

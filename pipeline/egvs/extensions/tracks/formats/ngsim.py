@@ -22,8 +22,6 @@ from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 from egvs.extensions.tracks.motion import motion_yaw_rad
 
-NAME = "NGSIM trajectories"
-
 FOOT_M = 0.3048
 _REQUIRED = ("Vehicle_ID", "Global_Time", "Local_X", "Local_Y", "v_Length", "v_Width", "v_Class")
 _CLASSES = {"1": "motorcycle", "2": "car", "3": "truck"}

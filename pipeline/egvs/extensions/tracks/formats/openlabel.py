@@ -34,8 +34,6 @@ from egvs.extensions.tracks.formats.documents import Node, read_document
 from egvs.extensions.tracks.formats.openlabel_poses import SystemPose, pose_in_station, pose_in_world
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 
-NAME = "OpenLABEL"
-
 _SWEEP_NAME = re.compile(r"(\d{9,11})_(\d{1,9})_(.+)\.json(\.gz)?")
 _MAX_LENGTH_ERROR = 0.01
 """Of a quaternion."""

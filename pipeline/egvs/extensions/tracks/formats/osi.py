@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from osi3.osi_groundtruth_pb2 import GroundTruth
     from osi3.osi_object_pb2 import MovingObject
 
-NAME = "ASAM OSI"
-
 _MCAP = b"\x89MCAP0\r\n"
 _TRUTH, _VIEW = "osi3.GroundTruth", "osi3.SensorView"
 _LENGTH = struct.Struct("<I")

@@ -17,8 +17,6 @@ from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.formats.geographic import to_utm
 from egvs.extensions.tracks.model import Tracks
 
-NAME = "pNEUMA trajectories"
-
 _VEHICLE = ("track_id", "type", "traveled_d", "avg_speed")
 _POSITION = ("lat", "lon", "speed", "lon_acc", "lat_acc", "time")
 _CLASSES = {

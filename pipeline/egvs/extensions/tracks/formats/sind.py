@@ -14,8 +14,6 @@ from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.formats.interaction import MAP_FRAME
 from egvs.extensions.tracks.model import Tracks
 
-NAME = "SinD tracks"
-
 _REQUIRED = ("track_id", "timestamp_ms", "agent_type", "x", "y")
 _FURTHER = ("ax", "ay")
 _CLASSES = {

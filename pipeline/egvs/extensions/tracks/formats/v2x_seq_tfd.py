@@ -17,8 +17,6 @@ from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.boxes import ClassNames, make_tracks
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 
-NAME = "V2X-Seq trajectory forecasting"
-
 _REQUIRED = ("timestamp", "id", "type", "sub_type", "x", "y", "theta")
 _OPTIONAL = ("z", "length", "width", "height")
 

@@ -19,7 +19,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import XY, Roi
 from egvs.core.wording import number_of
 from egvs.creation.junctions import Streets
-from egvs.creation.openstreetmap.street_network import NETWORK_FILE
+from egvs.creation.plain_network import NETWORK_FILE
 from egvs.extensions.tracks import recorded_tracks
 from egvs.extensions.tracks import sources as track_readers
 from egvs.extensions.tracks.model import Tracks

@@ -133,6 +133,8 @@ def make_detector(name: str, where: str = "--detector") -> Detector:
     if name in _REQUIRED_LIBRARIES:
         plugins.require_libraries(f"the detector {name}", "validate", _REQUIRED_LIBRARIES[name])
     detector_class = plugins.load_plugin(DETECTORS_GROUP, name)
+    expected = f"a class with NAME, SOURCE, settings and at_site, see {__name__}"
+    plugins.check_plugin(DETECTORS_GROUP, name, detector_class, ("NAME", "SOURCE", "settings", "at_site"), expected)
     if name != detector_class.NAME:
         problem = f"expected the NAME {name!r} of its entry point, got {detector_class.NAME!r}"
         raise plugins.plugin_error(DETECTORS_GROUP, name, problem)
