@@ -31,7 +31,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import IO, Any, cast
 
-from egvs.core import files, limits, plugins
+from egvs.core import limits, plugins
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError, MissingBackendError
 
 GROUP = "egvs.readers"
@@ -179,7 +180,7 @@ def read_head(path: Path) -> bytes:
     if not path.is_file():
         raise InputError(path, "no such file", "Check the path.")
     try:
-        with files.open_input(path) as content:
+        with open_input(path) as content:
             head: bytes = content.read(HEAD_BYTES)
     except OSError as error:
         problem = f"the file cannot be read ({error.strerror or error})"
@@ -187,7 +188,7 @@ def read_head(path: Path) -> bytes:
     if not head.startswith(_GZIP):
         return head
     try:
-        with files.open_input(path) as content, gzip.open(content) as unpacked:
+        with open_input(path) as content, gzip.open(content) as unpacked:
             return unpacked.read(HEAD_BYTES)
     except (EOFError, OSError, zlib.error):  # damaged: its reader says so
         return head
@@ -238,7 +239,7 @@ def _contains(path: Path, pattern: bytes) -> bool:
     search = re.compile(pattern).search
     size = 0
     try:
-        with files.open_input(path) as file, _unpacked(file) as content:
+        with open_input(path) as file, _unpacked(file) as content:
             rest = b""
             while chunk := content.read(_CHUNK_BYTES):
                 if search(rest + chunk):
