@@ -12,7 +12,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperGroup
 
 from egvs.core import plugins
 from egvs.core.errors import MissingBackendError
@@ -72,7 +72,8 @@ class ExtensibleGroup(TyperGroup):
                 self._add(extension)
             except MissingBackendError as error:
                 print(error, file=sys.stderr)
-        panel_of = {name: command.rich_help_panel for name, command in self.commands.items()}
+        commands: dict[str, Any] = dict(self.commands)  # Typer's own class of commands has no panel
+        panel_of = {name: command.rich_help_panel for name, command in commands.items()}
         *first, last = PANELS
         new = [panel for panel in panel_of.values() if panel not in PANELS]
         panels = list(dict.fromkeys([*first, *new, last]))
@@ -91,7 +92,7 @@ class ExtensibleGroup(TyperGroup):
 
 
 @cache
-def extension_commands(extension: str) -> dict[str, TyperCommand]:
+def extension_commands(extension: str) -> dict[str, Any]:
     """Load the commands of an extension, by name.
 
     Raises

@@ -17,7 +17,7 @@ convex polygon is convex; where sides touch or coincide it is a sliver without a
 change only last bits of the area.
 
 **Matching** (:func:`match_frames`) is that of Geiger, Lenz, Urtasun (CVPR 2012); its rules are described in
-:mod:`egvs.extensions.validation.detection_metrics`.
+the detection metrics of the extension validation.
 """
 
 from __future__ import annotations
