@@ -336,7 +336,7 @@ def draw_sheet(planned: PlannedSites, data: SheetData) -> str:
     picture_height = inner / 2.0
     session = planned.session
     camera = view.camera_pose(data.pose, data.sensor, session.scene.roi)
-    pixels = view.render_view(session.scene, data.pose, data.sensor, session.carriageway)
+    pixels = view.render_view(session.scene, data.pose, data.sensor, session.work.inputs.carriageway)
     caption = f"View from the sensor, towards {format_angle(grid_bearing_deg(camera.yaw_deg))} from grid north"
     parts.append(_text(_MARGIN, top, f"{caption}, {view.HORIZONTAL_DEG:g}° wide", 15, bold=True))
     parts.append(
