@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from egvs.core import digests
+from egvs.core import digests, files
 from egvs.core.digests import Digests, hash_input, open_input, use_digests
 from egvs.core.errors import InputError
 
@@ -62,6 +62,16 @@ def test_files_of_the_run_and_large_files_are_read_each_time(tmp_path: Path, mon
         for content in (b"one", b"two"):
             path.write_bytes(content)
             with current.open(path) as file:
+                assert file.read() == content
+
+
+def test_temporary_files_are_read_and_hashed_each_time(tmp_path: Path) -> None:
+    current = Digests(tmp_path)
+    with files.temporary_folder() as folder:
+        for content in (b"one", b"two"):
+            (folder / "a").write_bytes(content)
+            assert current.of(folder / "a") == sha256(content)
+            with current.open(folder / "a") as file:
                 assert file.read() == content
 
 

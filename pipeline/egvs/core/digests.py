@@ -1,7 +1,8 @@
 """Digests of files, and the contents of input files: what is hashed is what is parsed.
 
 A run has one :class:`Digests`, which hashes each file once and reads each input file once. If the user edits a file
-meanwhile, the run goes on with what it has read, or ends with an error.
+meanwhile, the run goes on with what it has read, or ends with an error. Files that the run writes itself, in its folder
+or in temporary folders, are read each time.
 
 Files that did not change since an earlier run are not read again. Like git, this compares the size, the times of the
 last change (mtime and ctime), the inode and the device of a file with those from when it was hashed. A file is hashed
@@ -91,6 +92,8 @@ class Digests:
             When the file does not exist, or differs from the one in ``run.json``.
         """
         name = os.path.realpath(path)
+        if not self._is_in_folder(name) and files.is_temporary(Path(name)):
+            return files.hash_file(path)
         if name not in self._digests:
             digest = self._earlier_digest(name)
             if digest is None:
@@ -131,9 +134,12 @@ class Digests:
                     if Path(file).is_relative_to(written):
                         del digests[file]
 
+    def _is_in_folder(self, name: str) -> bool:
+        return self._folder is not None and Path(name).is_relative_to(self._folder)
+
     def _can_hold(self, path: Path, name: str) -> bool:
         """Whether a file is an input file, and fits into memory."""
-        if self._folder is not None and Path(name).is_relative_to(self._folder):
+        if self._is_in_folder(name) or files.is_temporary(Path(name)):
             return False
         status = path.stat()
         return stat.S_ISREG(status.st_mode) and self._held_bytes + status.st_size <= MAX_HELD_BYTES

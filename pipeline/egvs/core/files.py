@@ -80,6 +80,11 @@ def temporary_folder() -> Iterator[Path]:
             return
 
 
+def is_temporary(path: Path) -> bool:
+    """Return whether a path lies in a folder of :func:`temporary_folder`."""
+    return any(part.startswith(_TEMP_PREFIX) for part in path.parts)
+
+
 @cache
 def _remove_stale_folders(parent: Path) -> None:
     """Remove the temporary folders of killed programs; once in a process."""
