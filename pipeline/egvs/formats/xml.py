@@ -141,15 +141,21 @@ def iter_elements(
         large or too deep, its gzip is damaged, or its encoding is unknown.
     """
     where = name or path
+    max_events = 2 * limits.XML_ELEMENTS.maximum  # each has a start and an end
     with _parse(path, name) as (events, meter):
         _, top = next(events)
         if root and top.tag != root:
             raise InputError(where, f"expected the root element <{root}>, got <{top.tag}>", "Check the file name.")
         if on_root is not None:
             on_root(top)
-        depth = 0
+        depth = count = 0
         for event, element in events:
             depth += 1 if event == "start" else -1
+            count += 1
+            if count > max_events:
+                raise InputError(
+                    where, f"has more than {limits.XML_ELEMENTS.maximum:,} elements", limits.XML_ELEMENTS.hint
+                )
             if depth > MAX_DEPTH:
                 raise InputError(where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
             if event == "end" and depth == 0:
