@@ -100,6 +100,23 @@ def read_batches(
         blocks.close()
 
 
+def decoded_bytes(batch: pa.RecordBatch) -> int:
+    """Return the size of a batch if no value were encoded as an entry of a dictionary."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    size = 0
+    for array in batch.columns:
+        size += array.nbytes
+        if not pa.types.is_dictionary(array.type):
+            continue
+        values = array.dictionary
+        if pa.types.is_binary(values.type) or pa.types.is_string(values.type):
+            lengths = pc.binary_length(values)
+            size += pc.sum(lengths.take(array.indices)).as_py() or 0
+    return size
+
+
 def _blocks(
     path: Path, doing: str, where: str, columns: Sequence[str] | None, texts: Sequence[str]
 ) -> Generator[Block, None, None]:

@@ -27,7 +27,7 @@ from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE
 from egvs.formats import arrow_files
-from egvs.formats.gdal_layers import read_layer
+from egvs.formats.gdal_layers import FEATURE_BYTES, read_layer
 
 GIS_FORMATS = {
     ".gpkg": "GeoPackage", ".shp": "Shapefile", ".kml": "KML", ".parquet": "GeoParquet", ".geoparquet": "GeoParquet",
@@ -150,11 +150,10 @@ def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
 def _bounded_table(path: Path, doing: str, columns: list[str]) -> pa.Table:
     """Return columns of a file that is small enough to be held as features."""
     batches = []
-    rows = size = 0
+    size = 0
     for batch in arrow_files.read_batches(path, doing, columns):
-        rows, size = rows + batch.num_rows, size + batch.nbytes
-        limits.ROWS.check(path, rows)
-        limits.DOCUMENT.check_bytes(path, size, f"has more than {limits.DOCUMENT.maximum} MB after decompression")
+        size += arrow_files.decoded_bytes(batch) + FEATURE_BYTES * batch.num_rows
+        limits.DOCUMENT.check_bytes(path, size, f"has more than {limits.DOCUMENT.maximum} MB as GeoJSON")
         batches.append(batch)
     if not batches:
         raise InputError(path, "contains no rows", _EXPORT_HINT)

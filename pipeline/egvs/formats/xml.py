@@ -148,14 +148,11 @@ def iter_elements(
             raise InputError(where, f"expected the root element <{root}>, got <{top.tag}>", "Check the file name.")
         if on_root is not None:
             on_root(top)
-        depth = count = 0
-        for event, element in events:
+        depth = 0
+        for number, (event, element) in enumerate(events):
             depth += 1 if event == "start" else -1
-            count += 1
-            if count > max_events:
-                raise InputError(
-                    where, f"has more than {limits.XML_ELEMENTS.maximum:,} elements", limits.XML_ELEMENTS.hint
-                )
+            if number > max_events:
+                limits.XML_ELEMENTS.check(where, number, f"has more than {max_events // 2:,} elements")
             if depth > MAX_DEPTH:
                 raise InputError(where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
             if event == "end" and depth == 0:
