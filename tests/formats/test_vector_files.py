@@ -185,7 +185,7 @@ def test_text_that_is_not_utf_8_is_rejected(located: Path, suffix: str, text: by
 
 def test_parquet_without_geometry_is_rejected(located: Path) -> None:
     pq.write_table(pa.table({"site": ["a"], "x_m": [1.0]}), located / "poles.parquet")
-    with pytest.raises(InputError, match=r"poles\.parquet: the file cannot be read as GeoParquet \(KeyError\(b'geo'\)"):
+    with pytest.raises(InputError, match=r"poles\.parquet: the file cannot be read as GeoParquet \(KeyError\('geo'\)"):
         candidates(located, "poles.parquet")
 
 

@@ -16,6 +16,7 @@ import os
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,7 @@ class DiagnosticsError(InputError):
 _UNIT_SUFFIX = re.compile(r"[_ ]?(m|deg|rad)$")
 _MIN_SIMILARITY = 0.8
 """Names that share more of their letters than this are similar."""
+_MAX_NAME_LENGTH = 80
 
 
 def find_misspelling(names: Iterable[str], known: Collection[str]) -> tuple[str, str] | None:
@@ -201,12 +203,21 @@ def find_misspelling(names: Iterable[str], known: Collection[str]) -> tuple[str,
         if name in known:
             continue
         low = name.strip().lower()
-        near = difflib.get_close_matches(low, missing, 1, _MIN_SIMILARITY)
         if meant := stems.get(_UNIT_SUFFIX.sub("", low)):
             return name, meant
-        if near and _name_similarity(low, near[0]) > _MIN_SIMILARITY:
-            return name, missing[near[0]]
+        near = _similar_name(low, tuple(missing))
+        if near is not None:
+            return name, missing[near]
     return None
+
+
+@lru_cache(maxsize=10_000)
+def _similar_name(name: str, known: tuple[str, ...]) -> str | None:
+    """Return the most similar known name; a file may repeat its columns in each of its rows."""
+    if len(name) > _MAX_NAME_LENGTH:  # the time grows with the square of the length
+        return None
+    near = difflib.get_close_matches(name, known, 1, _MIN_SIMILARITY)
+    return near[0] if near and _name_similarity(name, near[0]) > _MIN_SIMILARITY else None
 
 
 def closest_first(name: str, known: Iterable[str]) -> list[str]:

@@ -158,11 +158,11 @@ def _nested_containers(value: Any) -> list[Any]:
 
 
 def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    table = dict(pairs)
-    if len(table) < len(pairs):
-        names = [key for key, _ in pairs]
-        duplicate = next(key for key in names if names.count(key) > 1)
-        raise ValueError(f"the key {duplicate!r} occurs twice in one object")
+    table = {}
+    for key, value in pairs:
+        if key in table:
+            raise ValueError(f"the key {key!r} occurs twice in one object")
+        table[key] = value
     return table
 
 

@@ -27,6 +27,8 @@ _DRIVERS = {"GeoPackage": "GPKG", "Shapefile": "ESRI Shapefile", "KML": "LIBKML"
 _SIGNATURES = {"GeoPackage": b"SQLite format 3\x00", "Shapefile": b"\x00\x00\x27\x0a"}
 _KML_ROOT = "kml"
 _JOURNALS = ("-wal", "-journal")
+FEATURE_BYTES = 100
+"""What a feature takes in a GeoJSON file beside its values: layers have the limit of GeoJSON files."""
 _MAX_NAMED_LAYERS = 10
 _EXPORT_HINT = "Export it again, with the encoding UTF-8, or use GeoJSON or CSV."
 
@@ -115,8 +117,8 @@ def _read_file(path: Path) -> Iterator[Block]:
     layers = _geopackage_tables(path) if kind == "GeoPackage" else pyogrio.list_layers(path).tolist()
     layer = _choose_layer(path, layers, geometry)
     metadata, table = pyogrio.read_arrow(path, layer=layer)
-    limits.ROWS.check(path, table.num_rows)
-    limits.DOCUMENT.check_bytes(path, table.nbytes, f"has {table.nbytes / limits.MB:,.0f} MB in the layer {layer}")
+    size = table.nbytes + FEATURE_BYTES * table.num_rows
+    limits.DOCUMENT.check_bytes(path, size, f"has {size / limits.MB:,.0f} MB as GeoJSON in the layer {layer}")
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, table.schema) as stream:
         stream.write_table(table)

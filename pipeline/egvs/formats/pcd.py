@@ -221,7 +221,7 @@ def _decompress_lzf(packed: bytes, size: int) -> bytearray | None:
     """
     out, at, end = bytearray(), 0, len(packed)
     try:
-        while at < end:
+        while at < end and len(out) <= size:
             control = packed[at]
             at += 1
             if control < 32:

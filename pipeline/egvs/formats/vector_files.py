@@ -1,9 +1,9 @@
 """Layers of GIS files as GeoJSON documents: GeoPackage, Shapefile, KML and GeoParquet.
 
 GeoPackage, Shapefile and KML are read by GDAL in a process of its own (:mod:`egvs.formats.gdal_layers`, extra ``gis``),
-GeoParquet (https://geoparquet.org) by pyarrow. The result is a FeatureCollection with the member ``crs``, as GeoJSON
-files of this program have it. So the same rules apply to all formats. Coordinates stay in the system of the file, x
-before y.
+GeoParquet (https://geoparquet.org) by pyarrow in another one (:mod:`egvs.formats.arrow_files`). The result is a
+FeatureCollection with the member ``crs``, as GeoJSON files of this program have it. So the same rules apply to all
+formats. Coordinates stay in the system of the file, x before y.
 
 KML: the altitude of a point counts only where it is ``relativeToGround``; Google Earth writes 0 where it is clamped to
 the ground. The fields of LIBKML that describe how a placemark is drawn are left out.
@@ -21,14 +21,14 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from egvs.core import plugins
+from egvs.core import limits, plugins
 from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE
-from egvs.formats.gdal_layers import read_layer
+from egvs.formats import arrow_files
+from egvs.formats.gdal_layers import FEATURE_BYTES, read_layer
 
 GIS_FORMATS = {
     ".gpkg": "GeoPackage", ".shp": "Shapefile", ".kml": "KML", ".parquet": "GeoParquet", ".geoparquet": "GeoParquet",
@@ -36,6 +36,7 @@ GIS_FORMATS = {
 """Formats by the suffix of their files."""
 
 _SHAPEFILE_PARTS = (".dbf", ".prj", ".cpg", ".shx")
+_EXPORT_HINT = "Export it again, or use GeoJSON or CSV."
 _KML_FIELDS = (
     "id", "timestamp", "begin", "end", "altitudeMode", "tessellate", "extrude", "visibility", "drawOrder", "icon",
 )  # fmt: skip
@@ -126,24 +127,38 @@ def _check_shapefile_complete(path: Path) -> None:
 
 def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
     """Return the table of a GeoParquet file, the name of its geometry column, and its reference system."""
+    doing = "the file cannot be read as GeoParquet"
+    header = arrow_files.read_header(path, doing)
     try:
-        table = pq.read_table(path)
-        table.validate(full=True)
-        header = json.loads((table.schema.metadata or {})[b"geo"])
-        name = header["primary_column"]
-        column = header["columns"][name]
+        geo = json.loads(header.metadata["geo"])
+        name = geo["primary_column"]
+        column = geo["columns"][name]
         encoding = column["encoding"]
         covering = column.get("covering", {}).get("bbox", {}).get("xmin", [None])[0]
-    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        problem = f"the file cannot be read as GeoParquet ({error!r})"[:200]
-        raise InputError(path, problem, "Export it again, or use GeoJSON or CSV.") from None
-    if encoding != "WKB" or name not in table.column_names:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(path, f"{doing} ({error!r})"[:200], _EXPORT_HINT) from None
+    if encoding != "WKB" or name not in header.columns:
         problem = f"expected a geometry column {name!r} encoded as WKB, got {encoding!r}"
         raise InputError(path, problem, "Export it again with the encoding WKB.")
-    if covering in table.column_names:
-        table = table.drop_columns([covering])
+    duplicates = sorted({column for column in header.columns if header.columns.count(column) > 1})
+    if duplicates:
+        raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Use each column name once.")
+    table = _bounded_table(path, doing, [column for column in header.columns if column != covering])
     crs = column.get("crs", "OGC:CRS84")
     return table, name, json.dumps(crs) if isinstance(crs, dict) else crs
+
+
+def _bounded_table(path: Path, doing: str, columns: list[str]) -> pa.Table:
+    """Return columns of a file that is small enough to be held as features."""
+    batches = []
+    size = 0
+    for batch in arrow_files.read_batches(path, doing, columns):
+        size += arrow_files.decoded_bytes(batch) + FEATURE_BYTES * batch.num_rows
+        limits.DOCUMENT.check_bytes(path, size, f"has more than {limits.DOCUMENT.maximum} MB as GeoJSON")
+        batches.append(batch)
+    if not batches:
+        raise InputError(path, "contains no rows", _EXPORT_HINT)
+    return pa.Table.from_batches(batches)
 
 
 def _feature(row: Mapping[str, Any], geometry_column: str, path: Path) -> dict[str, Any]:

@@ -142,6 +142,7 @@ def iter_elements(
         large or too deep, its gzip is damaged, or its encoding is unknown.
     """
     where = name or path
+    max_events = 2 * limits.XML_ELEMENTS.maximum  # each has a start and an end
     with _parse(path, name) as (events, meter):
         _, top = next(events)
         if root and top.tag != root:
@@ -149,8 +150,10 @@ def iter_elements(
         if on_root is not None:
             on_root(top)
         depth = 0
-        for event, element in events:
+        for number, (event, element) in enumerate(events):
             depth += 1 if event == "start" else -1
+            if number > max_events:
+                limits.XML_ELEMENTS.check(where, number, f"has more than {max_events // 2:,} elements")
             if depth > MAX_DEPTH:
                 raise InputError(where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
             if event == "end" and depth == 0:

@@ -67,6 +67,7 @@ _TOLERANCE_M = 0.1
 _MAX_M = 1e8  # larger values are not on Earth; they are rejected when the row is parsed
 _COLUMNS_HINT = "Use the columns x_m, y_m for metres of the world frame, or longitude, latitude for degrees."
 
+_MAX_COLUMNS = 500
 _COLUMN_NAME = re.compile(r"[^\x00-\x1f]{1,80}")
 _PLAIN_NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,17})(\.[0-9]+)?")  # "007" is a name
 
@@ -132,9 +133,17 @@ def _check_header(path: Path, names: list[str]) -> None:
             if separator in names[0]:
                 hint = "Use commas, and decimal points in the numbers."
                 raise InputError(path, f"the columns are separated by {separator!r}", hint)
+    _check_column_count(path, names)
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
         raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Use each column name once.")
+
+
+def _check_column_count(path: Path, names: Collection[str]) -> None:
+    """Raise an InputError when the sites of a file have too many columns: each is compared with the known ones."""
+    if len(names) > _MAX_COLUMNS:
+        problem = f"expected at most {_MAX_COLUMNS} columns, got {len(names):,}"
+        raise InputError(path, problem, "Remove columns that describe no site.")
 
 
 def read_features(path: Path, world: Georeference) -> Iterator[SiteRow]:
@@ -147,6 +156,8 @@ def read_features(path: Path, world: Georeference) -> Iterator[SiteRow]:
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, f"expected {expected}, got {reprlib.repr(document)[:120]}")
     check_site_count(len(document["features"]), path, "each feature is one", "Use fewer features.")
+    properties = (feature.get("properties") for feature in document["features"] if isinstance(feature, dict))
+    _check_column_count(path, {name for names in properties if isinstance(names, dict) for name in names})
     coordinates = geojson_coordinates(document["features"])
     reading = world.read_coordinates(coordinates, str(path), declared_crs(document, str(path)))
     for number, feature in enumerate(document["features"]):

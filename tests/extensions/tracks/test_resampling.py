@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from egvs.extensions.tracks.cleaning import CleanTracks, clean_tracks
-from egvs.extensions.tracks.resampling import MIN_GAP_STEPS, resample
+from egvs.extensions.tracks.resampling import resample
 from egvs.traffic.class_sizes import CLASS_SIZES
 from tests.extensions.tracks.rows import make_tracks, straight
 
@@ -85,8 +85,7 @@ def slow_positions(
             before_s, after_s = tracks.time_s[i], tracks.time_s[i + 1]
             if tracks.track[i] != tracks.track[i + 1] or tracks.part[i] != tracks.part[i + 1]:
                 continue
-            is_gap = after_s - before_s > MIN_GAP_STEPS * tracks.report.step_s
-            if is_gap and after_s - before_s > max_gap_s + 1e-6:
+            if after_s - before_s > max_gap_s + 1e-6:
                 continue
             if before_s + 1e-6 < time_s < after_s - 1e-6:
                 share = (time_s - before_s) / (after_s - before_s)

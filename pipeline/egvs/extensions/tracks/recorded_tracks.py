@@ -118,6 +118,8 @@ class RecordedTracks:
         for first in range(0, self.window.count, FRAMES_EACH):
             rows = slice(*np.searchsorted(boxes.frame, [first, first + FRAMES_EACH]))
             track, yaw_rad = boxes.track[rows], boxes.yaw_rad[rows]
+            if not track.size:
+                continue  # a pause: readers expect rows, and see from their times that frames are empty
             zeros = np.zeros(track.size)
             front_m = np.column_stack([
                 boxes.x_m[rows] + half_m[track] * np.cos(yaw_rad), boxes.y_m[rows] + half_m[track] * np.sin(yaw_rad)

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from egvs.core import limits
 from egvs.core.grid import FloatArray, IntArray
 from egvs.extensions.tracks.cleaning import CleanTracks
 
@@ -97,21 +98,28 @@ def resample(tracks: CleanTracks, first_s: float, period_s: float, n_frames: int
         Frame k is at first_s + k * period_s.
     max_gap_s
         Longest gap that is interpolated.
+
+    Raises
+    ------
+    InputError
+        When there are more boxes than :data:`egvs.core.limits.BOXES`.
     """
     frame_s = first_s + np.arange(n_frames) * period_s
     # a rounding error in the time of a row must not cost its frame
     tolerance_s = 1e-6
     gap_s = np.diff(tracks.time_s)
     same_track = np.diff(tracks.track) == 0
-    is_gap = same_track & (gap_s > MIN_GAP_STEPS * tracks.report.step_s)
     is_jump = same_track & (np.diff(tracks.part) != 0)
-    is_long = (is_gap & (gap_s > max_gap_s + tolerance_s)) | is_jump
+    is_long = (same_track & (gap_s > max_gap_s + tolerance_s)) | is_jump
+    is_gap = (same_track & (gap_s > MIN_GAP_STEPS * tracks.report.step_s)) | is_long
     is_joined = same_track & ~is_long
 
     first_frame = np.searchsorted(frame_s, tracks.time_s[:-1] - tolerance_s)
     end_frame = np.searchsorted(frame_s, tracks.time_s[1:] - tolerance_s)
     gap_frame = np.searchsorted(frame_s, tracks.time_s[:-1] + tolerance_s, side="right")
     pairs = np.flatnonzero(is_joined)
+    n_boxes = int((end_frame[pairs] - first_frame[pairs]).sum())
+    limits.BOXES.check("traffic.tracks", n_boxes, f"gives {n_boxes:,} boxes in {n_frames:,} frames")
     left, frame = _repeat_over_frames(pairs, first_frame, end_frame)
     # the last row of a joined sequence is at a frame, too, if the times agree
     is_last = np.append(~is_joined, True)

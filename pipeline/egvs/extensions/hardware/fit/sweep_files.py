@@ -158,7 +158,9 @@ def _read_file(path: Path, name: str) -> list[Sweep]:
 
 def _read_npz(path: Path, name: str) -> Iterator[Sweep]:
     try:
-        with path.open("rb") as file, zipfile.ZipFile(file), np.load(file, allow_pickle=False) as arrays:
+        with path.open("rb") as file, zipfile.ZipFile(file) as archive, np.load(file, allow_pickle=False) as arrays:
+            unpacked = sum(member.file_size for member in archive.infolist())
+            limits.UNPACKED.check_bytes(name, unpacked, f"has {unpacked / limits.MB:,.0f} MB after decompression")
             if not arrays.files:
                 raise InputError(name, "expected an array for each sweep, got none", _NPZ_HINT)
             for key in arrays.files:
