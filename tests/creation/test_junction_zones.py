@@ -66,11 +66,11 @@ def test_file_of_the_scenario_has_the_zones(made: tuple[Path, tuple[Zone, ...]])
 
 def test_roundabout_has_its_ring_as_conflict_area(tmp_path: Path) -> None:
     made = create_scenario(tmp_path / "made", ROUNDABOUT)
-    area = {zone.name: zone.area for zone in made.zones}
+    area = {zone.name: zone.area for zone in made.region.zones}
     assert made.junction.ring is not None
     assert area["conflict area"].buffer(1.0).covers(shapely.Point(made.junction.at_m)) is False  # the island
     assert shapely.convex_hull(area["conflict area"]).covers(shapely.Point(made.junction.at_m))
-    assert sum(zone.kind == "stop line" for zone in made.zones) == 4
+    assert sum(zone.kind == "stop line" for zone in made.region.zones) == 4
 
 
 def test_equal_names_are_numbered() -> None:

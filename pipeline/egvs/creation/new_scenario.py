@@ -866,7 +866,7 @@ def _scenario_toml(draft: _Draft, statics: TomlTable) -> str:
         "junction_blocker_s": JUNCTION_BLOCKER_S,
         "teleport_s": TELEPORT_S,
     }
-    traffic = dict(draft.plan.keys) if draft.plan.is_finished else {**traffic, **draft.plan.keys}
+    traffic = ({} if draft.plan.is_finished else traffic) | dict(draft.plan.keys)
     tables = {
         "roi": (roi_comment, roi | scenario_files.voxel_keys()),
         "traffic": ("recorded; nothing is simulated" if draft.plan.is_finished else "SUMO", traffic),
