@@ -20,6 +20,7 @@ from egvs.export.extrinsics import PosedSensor
 from egvs.export.finished_run import ExportCrs
 from egvs.export.scene_files import WORLD_NODE, SceneMesh, make_gltf, posed_sensors, scene_origin_m
 from egvs.formats.georeference import WorldFrame
+from egvs.results.plans import PlannedSensor
 from egvs.sensors.sites import Pose
 from tests.export.conftest import EPSG, OFFSET_M
 
@@ -151,8 +152,9 @@ def test_exported_usd_has_the_poses(located: Path, tmp_path: Path) -> None:
 
 
 def test_sensors_of_a_plan_have_their_poses_in_it(located: Path) -> None:
-    moved = {"site": "pole_a", "x_m": 1.0, "y_m": 2.0, "z_m": 3.0, "yaw_deg": 4.0, "pitch_deg": 5.0, "roll_deg": 6.0}
-    run: Any = SimpleNamespace(plan=SimpleNamespace(rows=[moved]), artefact=lambda name: located / name)
+    pose = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    moved = PlannedSensor(1, "pole_a", "pole_a", *pose, "VLP-32C", forced=False, gain=1.0, score=1.0, cost=0.0)
+    run: Any = SimpleNamespace(plan=SimpleNamespace(sensors=[moved]), artefact=lambda name: located / name)
     poses = {sensor.site: sensor.pose for sensor in posed_sensors(run)}
     assert poses["pole_a"] == Pose(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     run.plan = None
