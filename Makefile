@@ -8,25 +8,37 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # Every process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run environment test test-slow test-nightly test-core test-extensions without test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics pictures schema reference docs notebooks fuzz clean
+.PHONY: run environment test test-slow test-nightly without test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics pictures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
 
+EXTENSIONS := city hardware maps tracks validation
+TRAINING := tests/extensions/validation/training
+# Pages, studies and damaged files of all parts of the program.
+COMPLETE_TESTS := tests/benchmarks tests/docs tests/fuzz tests/install
+
+# Tests of the core run in a copy without any extension; those of extensions and of the complete program, with all.
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m "not slow" --ignore=tests/extensions/validation/training
+	$(BIN)/python .ci/without.py $(EXTENSIONS) --tests "not slow" --leave-out $(COMPLETE_TESTS)
+	$(BIN)/python -m pytest -m "not slow" --ignore=$(TRAINING) tests/extensions $(COMPLETE_TESTS)
 
 # Sweeps, whole studies, browsers, kills: what takes more than some tenths of a second each.
 test-slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m "slow and not nightly" --ignore=tests/extensions/validation/training
+	$(BIN)/python .ci/without.py $(EXTENSIONS) --tests "slow and not nightly" --leave-out $(COMPLETE_TESTS)
+	$(BIN)/python -m pytest -m "slow and not nightly" --ignore=$(TRAINING) tests/extensions $(COMPLETE_TESTS)
+
+# Each extension is taken away alone: imports, main commands, and the same artefacts as with all of them.
+without: $(VENV)/.installed-dev
+	$(BIN)/python .ci/without.py --each $(EXTENSIONS)
 
 # Statistics over many simulations, which take minutes each.
 test-nightly: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m nightly --ignore=tests/extensions/validation/training
+	$(BIN)/python -m pytest -m nightly --ignore=$(TRAINING)
 
 # PyTorch is large, and only those who train a detector need it.
 test-train: $(VENV)/.installed-train
-	$(BIN)/python -m pytest -n 0 tests/extensions/validation/training
+	$(BIN)/python -m pytest -n 0 $(TRAINING)
 
 # The lowest versions that pyproject.toml allows, in an environment of its own. Old libraries warn about newer ones.
 test-lowest: $(VENV)/.installed
@@ -39,21 +51,7 @@ test-lowest: $(VENV)/.installed
 
 # Without the modules and flags that only POSIX systems have: the unit tests of what depends on the system.
 test-portable: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m unit -p tests.without_posix --ignore=tests/extensions/validation/training
-
-EXTENSIONS := city hardware maps tracks validation
-
-# Each extension is taken away alone: imports, main commands, and the same artefacts as with all of them.
-without: $(VENV)/.installed-dev
-	$(BIN)/python .ci/without.py --each $(EXTENSIONS)
-
-# The tests of the core in a copy without any extension; those of extensions and of the complete program with all.
-test-core: $(VENV)/.installed-dev
-	$(BIN)/python .ci/without.py $(EXTENSIONS) --tests
-
-test-extensions: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m "not nightly" --ignore=tests/extensions/validation/training \
-		tests/extensions tests/benchmarks tests/docs tests/fuzz tests/install
+	$(BIN)/python -m pytest -m unit -p tests.without_posix --ignore=$(TRAINING)
 
 # The quick loop: no other program is started, nothing takes long.
 unit: $(VENV)/.installed-dev

@@ -1,6 +1,6 @@
 """Take extensions away in a copy of the repository, and show that the rest of the program works.
 
-usage: python .ci/without.py NAME... [--each] [--tests [PATH...]]
+usage: python .ci/without.py NAME... [--each] [--tests MARKS [--leave-out PATH...]]
 
 The copy, in ``build/without``, has the tracked files without ``pipeline/egvs/extensions/NAME``, the tests of NAME and
 its entry points. Its wheel is built and unpacked, and comes before the installed package through PYTHONPATH. Then:
@@ -9,7 +9,7 @@ its entry points. Its wheel is built and unpacked, and comes before the installe
 2. ``egvs --help`` lists no command of NAME, and each of them is refused with the name of the extension;
 3. ``new``, ``run``, ``place``, ``report``, ``explore``, ``export`` and ``accuracy`` end with 0, and write the same
    artefacts as the complete program (``same.py``);
-4. with ``--tests`` instead of 3, the tests of the core pass, except nightly ones and :data:`COMPLETE_TESTS`.
+4. with ``--tests`` instead of 3, those tests of the core pass that have the marks.
 
 With ``--each``, one extension after the other is taken away alone.
 """
@@ -33,9 +33,6 @@ import tomlkit
 ROOT = Path(__file__).resolve().parent.parent
 BEGIN_S = time.monotonic()
 JUNCTION = ("scenarios/roundabout", "--set", "traffic.frames=200")
-
-COMPLETE_TESTS = ("tests/benchmarks", "tests/docs", "tests/fuzz", "tests/install")
-"""Tests of the complete program: pages, studies and damaged files of all its parts."""
 
 UNCOMPARED = ("accuracy", "store")
 """What depends on the time that commands take: which settings a study tries, and records of costs."""
@@ -65,7 +62,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="+", metavar="NAME", help="folders of pipeline/egvs/extensions")
     parser.add_argument("--each", action="store_true", help="take one after the other away, instead of all together")
-    parser.add_argument("--tests", nargs="*", metavar="PATH", help="run the tests of the core, or those in PATH")
+    parser.add_argument("--tests", metavar="MARKS", help="run the tests of the core, as pytest -m MARKS")
+    parser.add_argument("--leave-out", nargs="*", default=(), metavar="PATH", help="tests of the complete program")
     options = parser.parse_args()
 
     expected = None
@@ -80,7 +78,7 @@ def main() -> None:
         reduced.check_modules(prefixes)
         reduced.check_help(names)
         if expected is None:
-            reduced.check_tests(options.tests or ["tests"])
+            reduced.check_tests(options.tests, options.leave_out)
         else:
             run_commands(reduced)
             compare(expected, reduced.out)
@@ -197,12 +195,13 @@ class ReducedProgram(Program):
                     sys.exit(f"egvs {command} does not say that it needs {name}: {printed}")
         report("the help lists no command of what was taken away")
 
-    def check_tests(self, paths: Sequence[str]) -> None:
-        """Run the tests of the core, except nightly ones."""
+    def check_tests(self, marks: str, left_out: Sequence[str]) -> None:
+        """Run the tests of the core that have the marks."""
         environment = {**self.environment, "PYTHONPATH": f"{self.site}{os.pathsep}{self.copy}"}
-        words = [sys.executable, "-m", "pytest", "-q", "-m", "not nightly", "-p", "no:cacheprovider", *paths]
-        words += [f"--ignore={path}" for path in COMPLETE_TESTS]
-        subprocess.run(words, cwd=self.copy, env=environment, check=True)
+        words = [sys.executable, "-m", "pytest", "-q", "-m", marks, "-p", "no:cacheprovider"]
+        words += [f"--ignore={path}" for path in left_out]
+        if subprocess.run(words, cwd=self.copy, env=environment).returncode:
+            sys.exit("tests of the core failed without the extensions")
         report("tests")
 
 
