@@ -55,6 +55,10 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         files.append(File.generated(config, _VIEW.name, abs_src_path=str(_VIEW)))
 
 
+_PICTURE = re.compile(r"<!-- picture of packages -->.*?<!-- end of picture -->", re.DOTALL)
+"""The picture as text, for readers of the file; the site has a drawing of the imports in its place."""
+
+
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put tables and pictures in place of ``<!-- names of egvs -->`` and the like."""
     del config
@@ -66,6 +70,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         shown = {name for what, name in _INSERT.findall(markdown) if what == "study table"}
         if missing := tables.study_files() - shown:
             raise ValueError(f"docs/validity-tables.md does not show {', '.join(sorted(missing))}")
+    markdown = _PICTURE.sub("<!-- picture of packages -->", markdown)
     if page.file.src_uri == "notebooks/index.md":
         markdown = notebooks.gallery(markdown)
     return notebooks.link_pages(_INSERT.sub(lambda m: _MAKE[m[1]](m[2]), markdown))
