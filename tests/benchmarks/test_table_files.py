@@ -9,7 +9,7 @@ import pytest
 from benchmarks.across_junctions import table_files
 from benchmarks.across_junctions.table_files import Cell, Column, Table, number, with_interval
 
-from egvs.statistics.ranks import ConfidenceInterval
+from egvs.extensions.validation.correlation import ConfidenceInterval
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from egvs.core import readers
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.creation import map_readers
 from tests.core.test_plugins import install_readers, site  # noqa: F401  the fixture
@@ -67,14 +68,14 @@ def test_rejects_truncated_file_in_folder_by_name(tmp_path: Path, run_egvs) -> N
 
 def test_rejects_unreadable_file_in_folder_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "locked.gml").write_text("<CityModel/>")
-    real = map_readers.open_input
+    real = readers.open_input
 
     def open_input(path: Path) -> object:
         if path.name == "locked.gml":
             raise PermissionError(13, "Permission denied", str(path))
         return real(path)
 
-    monkeypatch.setattr(map_readers, "open_input", open_input)
+    monkeypatch.setattr(readers, "open_input", open_input)
     with pytest.raises(InputError, match=r"locked.gml: the file cannot be read \(Permission denied\)"):
         map_readers.list_files([tmp_path])
 

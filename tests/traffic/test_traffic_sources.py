@@ -89,7 +89,7 @@ def test_help_hides_recordings_without_the_extension(run_egvs, request: pytest.F
 
 def test_stages_name_the_modules_of_a_source(mini: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A changed extension makes the check and the traffic again."""
-    from egvs.stages.inputs import open_folder
+    from egvs.runs.run_context import open_folder
 
     monkeypatch.setattr(plugins, "load_plugin", lambda group, name: SmallSource())
     monkeypatch.setattr(plugins, "plugin_names", lambda group: ["small"] if group == traffic_sources.GROUP else [])

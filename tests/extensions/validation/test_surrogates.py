@@ -127,7 +127,7 @@ S = SurrogateScore('wrong', 'f', 's', 1, lambda e: {})
 @pytest.mark.parametrize(
     ("source", "problem"),
     [
-        ("S = dict", "it has no name, formula, source, sign, function"),
+        ("S = dict", "expected a egvs.extensions.validation.surrogates.SurrogateScore, got a type"),
         (
             WRONG + "from types import SimpleNamespace\nS = SimpleNamespace(**vars(S))",
             "expected a egvs.extensions.validation.surrogates.SurrogateScore, got a",

@@ -227,7 +227,7 @@ def test_chongqing(tmp_path: Path) -> None:
 def test_new_scenario_runs_at_once(tmp_path: Path, run_egvs, monkeypatch: pytest.MonkeyPatch) -> None:
     """--run hands the new folder to what egvs run does."""
     folders = []
-    monkeypatch.setattr("egvs.cli.app._run_all_stages", lambda path, *_, **__: folders.append(path))
+    monkeypatch.setattr("egvs.cli.app.run", folders.append)
     (tmp_path / "map.net.xml").write_text(NETWORK)
     tracks = write_recording(tmp_path / "tracks.csv")
     options = ["--from", tmp_path / "map.net.xml", "--tracks", tracks, "--track-crs", "world"]
