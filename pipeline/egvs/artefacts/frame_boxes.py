@@ -17,7 +17,7 @@ PITCHED_BOX_COLUMNS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", 
 
 UNKNOWN_BOXES_KEY = "unknown_boxes"
 """Key of the metadata with the gaps in recorded tracks during which positions are unknown, only where there are some;
-see :meth:`egvs.extensions.tracks.recorded_tracks.RecordedTracks.unknown_boxes`."""
+see ``RecordedTracks.unknown_boxes`` of the extension tracks."""
 
 MIN_BOX_M, MAX_BOX_M = 1e-3, 2000.0
 """Limits of the sizes of a box: it must stay a box when it is made smaller on each side, and no train is longer."""

@@ -44,7 +44,7 @@ CLASS_SIZES = {
     "pedestrian": ClassSize(0.80, 0.60, 1.73, "pedestrian", _KITTI),
     "other": ClassSize(2.40, 1.10, 1.60, "moped", f"{_SIND}, 33 tricycles; height assumed"),
 }
-"""Size of each class in :data:`egvs.extensions.tracks.model.CLASSES`."""
+"""Size of each class of road users in recorded tracks."""
 
 
 def class_sizes(traffic: TrafficConfig) -> dict[str, ClassSize]:
