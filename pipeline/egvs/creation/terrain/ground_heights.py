@@ -21,9 +21,6 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.core.wording import by_number, number_of
 from egvs.creation.map_parts import MapContext, Terrain
 
-_EDGE_SHARE = 1e-9
-"""A point may be outside a triangle by this share of it: it is on a side."""
-
 LOWEST_M, HIGHEST_M = -1000.0, 9000.0
 """Limits of heights above sea level; -9999, which often stands for unknown heights, is below."""
 
