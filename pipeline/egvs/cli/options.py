@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperCommand
 
 from egvs.core.errors import InputError
+from egvs.core.numbers import number_or_nan
 
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario folder, or its scenario.toml.")]
 SettingsPath = Annotated[
@@ -169,10 +170,7 @@ def radius_m(text: str) -> float:
 
     if text == "all":
         return math.inf
-    try:
-        radius = float(text)
-    except ValueError:
-        radius = math.nan
+    radius = number_or_nan(text)
     if not 0 < radius <= MAX_COORDINATE_M:
         problem = f"expected a length in metres, or all, got {text[:80]!r}"
         raise InputError("--surroundings", problem, "Use a length such as 300.")
