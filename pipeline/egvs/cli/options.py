@@ -110,13 +110,6 @@ def heights_m(text: str) -> tuple[float, float]:
     raise InputError("--heights", f"expected LOW,HIGH in metres, got {text!r}", "Use heights such as 2,7.")
 
 
-def model_file(path: Path) -> Path:
-    """Return ``--out`` of ``egvs train``, whose name must end in .onnx."""
-    if path.suffix != ".onnx":
-        raise InputError("--out", f"expected a file that ends in .onnx, got {str(path)!r}", "Use --out model.onnx.")
-    return path
-
-
 def size_bytes(text: str) -> float:
     """Return the bytes of ``--max``, e.g. 500M or 2G."""
     size = _parse_quantity(text.removesuffix("B"), {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9, "T": 1e12})
