@@ -27,11 +27,12 @@ from benchmarks.measured_vehicles import (
     find_candidates,
     ground_heights,
 )
-from egvs.clouds.sweeps import BoolArray, Detections, SiteView, Sweep, detections_in_roi
+from egvs.clouds.sweeps import BoolArray, Detections, SiteView, Sweep
 from egvs.core.grid import FloatArray, Roi
 from egvs.extensions.hardware.fit import empty_scan, output
 from egvs.extensions.hardware.fit.empty_scan import EmptyScanFit
 from egvs.extensions.hardware.fit.fit import SensorFit
+from egvs.extensions.validation.detector_results import detections_in_roi
 from egvs.extensions.validation.detectors.cluster import Cluster
 from egvs.sensors.sites import Pose
 

@@ -35,8 +35,9 @@ from benchmarks.realism import (
     planned_scores,
     table_row,
 )
-from egvs.clouds.sweeps import DetectedBoxes, Detections, detections_in_roi
+from egvs.clouds.sweeps import Detections
 from egvs.core.grid import FloatArray, Roi
+from egvs.extensions.validation.detector_results import DetectedBoxes, detections_in_roi
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose
 

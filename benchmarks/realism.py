@@ -24,7 +24,6 @@ import egvs
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.clouds.sweeps import DetectorResult
 from egvs.core.grid import FloatArray, Roi
 from egvs.core.progress import no_progress
 from egvs.extensions.validation.detection_metrics import (
@@ -34,6 +33,7 @@ from egvs.extensions.validation.detection_metrics import (
     frame_blocks,
     measure_detection,
 )
+from egvs.extensions.validation.detector_results import DetectorResult
 from egvs.extensions.validation.detector_runs import SiteDetectionTask, run_detectors
 from egvs.extensions.validation.detectors.base import make_detector
 from egvs.extensions.validation.held_out_traffic import FrameSampling

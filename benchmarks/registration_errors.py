@@ -64,7 +64,7 @@ def _scores(folder: Path, scans: dict[str, Path], rng: np.random.Generator | Non
     shutil.copytree(SOURCE, folder)
     rows = []
     for row in _site_rows():
-        points_m = point_clouds.read_points(scans[row["site"]], row["site"]).points_m
+        points_m, _ = point_clouds.read_points(scans[row["site"]], row["site"])
         sensor_m = np.array([float(row[key]) for key in ("x_m", "y_m", "z_m")])
         if rng is not None:
             axis, direction = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))

@@ -21,9 +21,9 @@ from typing import Any
 import egvs
 from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core.resource_usage import measure_usage
 from egvs.extensions.validation import detection_metrics
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.detector_runs import SiteDetectionTask
 from egvs.extensions.validation.detectors import base
 from egvs.extensions.validation.held_out_traffic import MIN_SPACING_S, HeldOutTraffic, prepare_held_out_traffic

@@ -9,6 +9,7 @@ SYSTEM = (
     "tests/effects/test_pedestrians_bicycles",
     "tests/effects/test_slope",
     "tests/extensions/city/test_roundabout",
+    "tests/extensions/city/test_town_flow",
     "tests/extensions/hardware/installation/",
     "tests/extensions/maps/test_",
     "tests/extensions/tracks/formats/test_argoverse2",

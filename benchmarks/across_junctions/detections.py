@@ -19,7 +19,7 @@ from benchmarks.across_junctions import study_detectors
 from egvs.artefacts.traffic_frames import BOX_COLUMNS, TrafficFrame
 from egvs.clouds import simulation as cloud_simulation
 from egvs.clouds import sweeps
-from egvs.clouds.sweeps import POINT_COUNTS_NAME, DetectedBoxes, Detections, PointCounts
+from egvs.clouds.sweeps import Detections
 from egvs.core import files
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
@@ -35,6 +35,7 @@ from egvs.extensions.validation.detection_metrics import (
     frame_blocks,
     paired_overlap,
 )
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME, DetectedBoxes, PointCounts
 from egvs.extensions.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
 from egvs.extensions.validation.held_out_traffic import HeldOutTraffic
 from egvs.kernels.detection import OVERLAP_TOLERANCE

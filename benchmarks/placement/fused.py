@@ -15,7 +15,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core import files
 from egvs.extensions.validation import detection_metrics
 from egvs.extensions.validation.detection_metrics import (
@@ -24,6 +23,7 @@ from egvs.extensions.validation.detection_metrics import (
     SiteDetection,
     estimate_difference,
 )
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.detector_runs import run_detectors
 from egvs.extensions.validation.held_out_traffic import prepare_held_out_traffic
 from egvs.extensions.validation.plan_validation import FusedDetectionTask, SensorGroup, joint_detectors

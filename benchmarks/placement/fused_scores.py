@@ -25,7 +25,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.across_junctions.detections import hits_of
-from egvs.clouds.sweeps import DetectedBoxes, DetectorResult
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray
 from egvs.extensions.validation.detection_metrics import (
@@ -35,6 +34,7 @@ from egvs.extensions.validation.detection_metrics import (
     frame_blocks,
     measure_detection,
 )
+from egvs.extensions.validation.detector_results import DetectedBoxes, DetectorResult
 from egvs.extensions.validation.detector_runs import run_detectors
 from egvs.extensions.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
 from egvs.extensions.validation.plan_validation import FusedDetectionTask, SensorGroup, joint_detectors

@@ -436,16 +436,6 @@ def test_run_whose_scenario_is_gone_is_rejected(here: Path, run_egvs: Any) -> No
 # ---- the record
 
 
-def test_record_of_an_older_version_has_no_overrides(here: Path) -> None:
-    egvs.run(egvs.load(here, ["score.gamma=5"]))
-    path = RunFolder(OTHER).run_record
-    values = json.loads(path.read_text())
-    del values["overrides"], values[files.CHECKSUM_KEY]
-    path.write_text(json.dumps(add_checksum(values)))
-    assert RunRecord.read(OTHER).overrides == {}
-    assert run_list.list_runs()[0].problem == ""
-
-
 def test_record_with_overrides_of_another_type_is_rejected(here: Path) -> None:
     egvs.run(egvs.load(here))
     path = RunFolder(Path("runs/mini")).run_record

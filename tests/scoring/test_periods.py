@@ -267,7 +267,7 @@ def test_score_table_is_long_and_labelled() -> None:
     assert rows[:3] == [("a", "", 0, "egvs", 9.0), ("a", "morning", 0, "egvs", 9.0), ("a", "night", 0, "egvs", 3.0)]
     assert table.column("egvs", "night").values.tolist() == [3.0, 4.0]
     assert [column.best for column in table.by_period("egvs").values()] == [{0}, {1}]
-    assert table.ranking("egvs", "night") == [(1, "b", 4.0), (2, "a", 3.0)]
+    assert table.column("egvs", "night").rank.tolist() == [2, 1]
 
 
 def test_score_table_keeps_replicates_of_each_period() -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from egvs.artefacts.run_folder import RunFile, RunFolder
+from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 
 _CHECKSUM_LINE = re.compile(r"[0-9a-f]{64}  (.+)")
@@ -49,7 +49,7 @@ def foreign_files(folder: Path) -> Iterator[str]:
             unmarked.append(file)
 
     for file in unmarked:
-        if _can_have_metadata(file) or not written:
+        if file.name.endswith((".parquet", ".ply")) or not written:  # of the others, none has metadata
             yield file.name
 
 
@@ -65,10 +65,6 @@ def _recorded_names(folder: RunFolder) -> set[str]:
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
             names.update(match[1] for match in map(_CHECKSUM_LINE.fullmatch, lines) if match)
     return names
-
-
-def _can_have_metadata(file: RunFile) -> bool:
-    return file.name.endswith((".parquet", ".ply"))
 
 
 def _has_metadata(path: Path) -> bool:

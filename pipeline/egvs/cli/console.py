@@ -6,7 +6,7 @@ Results go to standard output; progress, stage lines and warnings go to standard
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Generic, Literal, TypeVar
@@ -18,7 +18,6 @@ from rich.text import Text
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.cli import stage_summary
-from egvs.cli.value_text import format_value, format_values
 from egvs.core.errors import collect_warnings
 from egvs.core.wording import format_percent
 
@@ -129,16 +128,6 @@ def format_or_dash(value: float | None, spec: str) -> str:
 def percent_or_dash(share: float | None, digits: int = 1) -> str:
     """Return a share in per cent, as :func:`~egvs.core.wording.format_percent`; "-" if it is unknown."""
     return "-" if share is None else format_percent(share, digits)
-
-
-def print_mapping(values: Mapping[str, Any], file_width: int) -> None:
-    """Print one line per key; ``file_width`` is that of :func:`console`."""
-    out = console(file_width)
-    for key, value in values.items():
-        text = format_value(value)
-        if isinstance(value, dict):
-            text = format_values(value)
-        out.print(f"{key}: {text}")
 
 
 class _ElapsedColumn(ProgressColumn):

@@ -13,6 +13,7 @@ import typer
 from typer.core import TyperCommand
 
 from egvs.core.errors import InputError
+from egvs.core.numbers import number_or_nan
 
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario folder, or its scenario.toml.")]
 SettingsPath = Annotated[
@@ -109,13 +110,6 @@ def heights_m(text: str) -> tuple[float, float]:
     raise InputError("--heights", f"expected LOW,HIGH in metres, got {text!r}", "Use heights such as 2,7.")
 
 
-def model_file(path: Path) -> Path:
-    """Return ``--out`` of ``egvs train``, whose name must end in .onnx."""
-    if path.suffix != ".onnx":
-        raise InputError("--out", f"expected a file that ends in .onnx, got {str(path)!r}", "Use --out model.onnx.")
-    return path
-
-
 def size_bytes(text: str) -> float:
     """Return the bytes of ``--max``, e.g. 500M or 2G."""
     size = _parse_quantity(text.removesuffix("B"), {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9, "T": 1e12})
@@ -169,10 +163,7 @@ def radius_m(text: str) -> float:
 
     if text == "all":
         return math.inf
-    try:
-        radius = float(text)
-    except ValueError:
-        radius = math.nan
+    radius = number_or_nan(text)
     if not 0 < radius <= MAX_COORDINATE_M:
         problem = f"expected a length in metres, or all, got {text[:80]!r}"
         raise InputError("--surroundings", problem, "Use a length such as 300.")

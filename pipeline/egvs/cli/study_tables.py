@@ -106,15 +106,12 @@ def _result_tables(comparison: Comparison, top: int | None, width: int) -> Itera
     start = 0
     while start < len(others):
         count = len(others) - start
-        while count > 1 and _result_width(comparison, [first, *others[start : start + count]], top, width) > width:
+        table = _result_table(comparison, [first, *others[start:]], top, width)
+        while count > 1 and _unwrapped_width(table) > width:
             count -= 1
-        yield _result_table(comparison, [first, *others[start : start + count]], top, width)
+            table = _result_table(comparison, [first, *others[start : start + count]], top, width)
+        yield table
         start += count
-
-
-def _result_width(comparison: Comparison, runs: Sequence[int], top: int | None, width: int) -> int:
-    """Return the width of a table of some runs, if nothing is wrapped."""
-    return _unwrapped_width(_result_table(comparison, runs, top, width))
 
 
 def _unwrapped_width(table: Table) -> int:

@@ -80,15 +80,6 @@ def peak_memory_mb() -> float:
     return float(getattr(memory, "peak_wset", memory.rss)) / (1024 * 1024)
 
 
-def limit_memory(limit_bytes: int) -> None:
-    """Let allocations of this process fail above a limit; Windows has no such limit."""
-    if not HAS_POSIX:
-        return
-    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-    soft = limit_bytes if hard == resource.RLIM_INFINITY else min(hard, limit_bytes)
-    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
 def raise_open_file_limit(count: int) -> None:
     """Let this process open so many files, as far as the system allows; Windows allows thousands anyway."""
     if not HAS_POSIX:

@@ -23,7 +23,6 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from egvs.core.grid import XY, FloatArray
 from egvs.creation.junctions import JunctionRegion, StreetJunction, Streets
 from egvs.creation.plain_network import NETWORK_FILE
 from egvs.traffic.approach_names import ApproachNames
@@ -128,11 +127,6 @@ def _crosswalks(network: Network, junction: StreetJunction, names: ApproachNames
                     yield Zone(names.crosswalk(edge.id), "crosswalk", lane.area())
 
 
-def _side(point_m: FloatArray, junction_m: XY) -> str:
-    """The compass point of a point, as seen from the junction."""
-    return compass(point_m - np.asarray(junction_m))
-
-
 def _approach_zones(network: Network, junction: StreetJunction, names: ApproachNames) -> Iterator[Zone]:
     """Stop lines, then approaches."""
     approaches = []
@@ -179,8 +173,8 @@ def _sidewalks(network: Network, junction: StreetJunction, region: BaseGeometry)
     for area in _walking_areas(network):
         part = shapely.intersection(area, region)
         if part.area > 0.0:
-            middle_m = shapely.get_coordinates(part.centroid)[0]
-            by_side.setdefault(_side(middle_m, junction.at_m), []).append(part)
+            side = compass(shapely.get_coordinates(part.centroid)[0] - np.asarray(junction.at_m))
+            by_side.setdefault(side, []).append(part)
     for side, parts in sorted(by_side.items()):
         yield Zone(f"{side} sidewalk", "sidewalk", shapely.union_all(parts))
 

@@ -603,18 +603,6 @@ def _separate_poles(points: Sequence[XY], center: XY, spacing_m: float) -> list[
     return poles
 
 
-@dataclass(frozen=True)
-class _Gates:
-    """The edges by which vehicles enter and leave a region.
-
-    ``connected`` has shape (n_entries, n_exits): 1 where a route without loop leads over entry and exit, otherwise 0.
-    """
-
-    entries: list[Edge]
-    exits: list[Edge]
-    connected: FloatArray
-
-
 def assumed_flows(streets: Streets, roi: JunctionRegion, ring: Ring | None = None) -> list[CountConfig]:
     """Assume the traffic through a region from the classes of its streets.
 
@@ -632,14 +620,14 @@ def assumed_flows(streets: Streets, roi: JunctionRegion, ring: Ring | None = Non
     list of CountConfig
         Vehicles per hour from each gate to each other gate; empty where no street leads through the region.
     """
-    gates = _find_gates(streets, roi, ring)
-    inflow_per_h = [edge_flow_h(edge) for edge in gates.entries]
-    outflow_per_h = [edge_flow_h(edge) for edge in gates.exits]
-    flows_per_h = balance_flows(gates.connected, inflow_per_h, outflow_per_h)
+    entries, exits, connected = _find_gates(streets, roi, ring)
+    inflow_per_h = [edge_flow_h(edge) for edge in entries]
+    outflow_per_h = [edge_flow_h(edge) for edge in exits]
+    flows_per_h = balance_flows(connected, inflow_per_h, outflow_per_h)
 
     counts = []
-    for row, entry in enumerate(gates.entries):
-        for column, exit_edge in enumerate(gates.exits):
+    for row, entry in enumerate(entries):
+        for column, exit_edge in enumerate(exits):
             per_hour = float(round(flows_per_h[row, column]))
             if per_hour == 0:
                 continue
@@ -702,7 +690,11 @@ def _growth_factors(target: FloatArray, current: FloatArray) -> FloatArray:
     return np.divide(target, current, out=np.zeros_like(target), where=current > 0)
 
 
-def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> _Gates:
+def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> tuple[list[Edge], list[Edge], FloatArray]:
+    """Return the edges by which vehicles enter and leave a region, and which of them a route without loop connects.
+
+    The last is 1 or 0, shape (n_entries, n_exits).
+    """
     edges = streets.network.edges
     links = [(source, target) for source, target, turnaround in streets.network.links(CAR).tolist() if not turnaround]
     successors: dict[int, list[int]] = {index: [] for index in _with_merging(_roads_inside(streets, roi), links)}
@@ -733,7 +725,7 @@ def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> _Ga
             to_edge = None if exit_index == entry else edges[exit_index].id
             location = routes.locate(edges[entry].id, to_edge, "assumed flows")
             connected[row, column] = routes.has_route_without_loop(location)
-    return _Gates([edges[i] for i in entries], [edges[i] for i in exits], connected)
+    return [edges[i] for i in entries], [edges[i] for i in exits], connected
 
 
 def _roads_inside(streets: Streets, roi: JunctionRegion) -> list[int]:

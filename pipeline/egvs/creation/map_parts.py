@@ -273,11 +273,9 @@ class Terrain(Protocol):
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user."""
-        raise NotImplementedError
 
     def height_m(self, xy_m: FloatArray) -> FloatArray:
         """Return the heights (n,) of the ground at world-frame points (n, 2), in metres; NaN where unknown."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -407,7 +405,6 @@ class RoadReader(Protocol):
 
     def read_roads(self, path: Path, options: RoadOptions) -> RoadMap:
         """Return the network of a road map; InputError when it is damaged."""
-        raise NotImplementedError
 
 
 @runtime_checkable
@@ -416,7 +413,6 @@ class SolidReader(Protocol):
 
     def read_solids(self, paths: Sequence[Path], context: MapContext) -> SolidMap:
         """Return the objects in the window; InputError when a file is damaged."""
-        raise NotImplementedError
 
 
 @runtime_checkable
@@ -425,4 +421,3 @@ class TerrainReader(Protocol):
 
     def read_terrain(self, paths: Sequence[Path], context: MapContext) -> Terrain:
         """Return the ground in the window; InputError when a file is damaged."""
-        raise NotImplementedError

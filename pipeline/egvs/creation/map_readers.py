@@ -127,7 +127,7 @@ def list_files(paths: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             listed[path] = None
             continue
-        inside = sorted(file for file in path.rglob("*") if file.is_file() and _can_be_opened(file))
+        inside = sorted(file for file in path.rglob("*") if file.is_file() and readers.find_reader(KIND, file))
         if not inside:
             raise InputError(path, "the folder contains no map that can be read", f"Formats: {describe_formats()}.")
         if len(inside) > MAX_FILES:
@@ -148,7 +148,3 @@ def find_reader(path: Path) -> Reader:
 def describe_formats(part: str | None = None) -> str:
     """Return the names of the formats, or of those with :data:`ROADS`, :data:`SOLIDS` or :data:`TERRAIN`."""
     return readers.describe_formats(KIND, part)
-
-
-def _can_be_opened(path: Path) -> bool:
-    return readers.find_reader(KIND, path) is not None

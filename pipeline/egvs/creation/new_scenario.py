@@ -907,15 +907,13 @@ def _assumptions(draft: _Draft) -> list[str]:
     return [*assumed, *draft.plan.assumptions, *assumed_sizes(draft.objects.counts), "positions of the poles"]
 
 
-def _assumed_buildings(heights: Counter[str]) -> int:
-    return heights[ASSUMED] + heights[NEIGHBOURS]
-
-
 def assumed_sizes(counts: ImportCounts) -> list[str]:
     """Return which sizes of static objects are assumed, for the key ``assumed``; objects that can hide vehicles."""
     heights = {kind: counts.heights.get(kind, Counter()) for kind in ("building", "tree", "bridge")}
+    building_heights = heights["building"]
+    assumed_buildings = building_heights[ASSUMED] + building_heights[NEIGHBOURS]
     texts = [
-        (_assumed_buildings(heights["building"]), heights["building"].total(), "heights of {}", "building"),
+        (assumed_buildings, heights["building"].total(), "heights of {}", "building"),
         (heights["tree"]["default"], heights["tree"].total(), "heights of {}", "tree"),
         (counts.assumed_crowns, heights["tree"].total(), "crown widths of {}", "tree"),
         (heights["bridge"]["default"], heights["bridge"].total(), "heights of {}", "bridge deck"),

@@ -126,11 +126,6 @@ class RecordingPlan:
     assumptions: tuple[str, ...] = ()
     read_back: Callable[[Scenario], ScenarioTraffic] | None = None
 
-    @property
-    def has_signals(self) -> bool:
-        """Whether the junction has recorded signals."""
-        return bool(self.signal_notes)
-
 
 class NewTraffic(Protocol):
     """Recordings for a new scenario."""

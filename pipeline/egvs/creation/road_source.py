@@ -28,48 +28,38 @@ class RoadSource(Protocol):
     @property
     def network(self) -> str:
         """The text of the network."""
-        raise NotImplementedError
 
     @property
     def streets(self) -> Streets:
         """The same network, read."""
-        raise NotImplementedError
 
     @property
     def attribution(self) -> str:
         """Who made the map, and its licence; empty if unknown."""
-        raise NotImplementedError
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user about the complete map."""
-        raise NotImplementedError
 
     @property
     def keeps_heights(self) -> bool:
         """Whether its heights are used as they are (:class:`~egvs.creation.map_parts.RoadMap`)."""
-        raise NotImplementedError
 
     @property
     def level_notes(self) -> tuple[str, ...]:
         """Sentences for the user about roads that :meth:`on_level_of` left out."""
-        raise NotImplementedError
 
     def on_level_of(self, junction: StreetJunction) -> RoadSource:
         """Return the roads without those that cross a junction's region on another level."""
-        raise NotImplementedError
 
     def around(self, junction: StreetJunction, radius_m: float | None) -> RoadSource:
         """Return the roads within a radius of a junction, in the same frame: all if it is inf, the default if None."""
-        raise NotImplementedError
 
     def edge_levels(self) -> dict[str, int]:
         """Return the levels of the edges that are known not to be on the ground: bridges and tunnels."""
-        raise NotImplementedError
 
     def solids(self, window: BaseGeometry) -> SolidMap | None:
         """Return the static objects of the road map in a window (world frame, metres); None: its reader reads them."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

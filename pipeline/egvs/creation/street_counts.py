@@ -29,6 +29,7 @@ from typing import Any
 import tomlkit
 
 from egvs.core.errors import InputError, find_misspelling
+from egvs.core.numbers import number_or_nan
 from egvs.core.wording import list_first, number_of
 from egvs.creation import junctions, scenario_files
 from egvs.creation.junctions import StreetJunction, Streets
@@ -419,10 +420,7 @@ def _parse_clock(where: str, text: str) -> int:
 
 
 def _parse_count(where: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = number_or_nan(text)
     if not 0 <= value <= _MAX_COUNT:
         problem = f"expected a number of vehicles of 0 to {_MAX_COUNT:,.0f}, got {text!r}"
         raise InputError(where, problem, "Use a number such as 120.")

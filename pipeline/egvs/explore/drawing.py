@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import combinations, product
-from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -304,7 +303,7 @@ def draw_sites(scene: viser.SceneApi, session: Session, zero_m: Vec3, on_click: 
     """Draw the candidates as balls, the best ones darkest; without ``on_click`` they cannot be clicked."""
     sites = [candidate.site for candidate in session.ranked]
     ball_colours = colour_scale([candidate.scores[session.rank_by] for candidate in session.ranked])
-    _draw_balls(scene, "/sites", _Balls(sites, ball_colours, _SITE_RADIUS_M), zero_m, on_click)
+    _draw_balls(scene, "/sites", sites, ball_colours, _SITE_RADIUS_M, zero_m, on_click)
 
 
 def draw_plan(
@@ -337,8 +336,8 @@ def draw_plan(
         labels.append("best next")
         ball_colours.append(_NEXT_SITE_COLOUR)
     scene.add_frame("/plan", show_axes=False)
-    balls = _Balls(sites, np.array(ball_colours, dtype=np.uint8), _PLAN_RADIUS_M)
-    _draw_balls(scene, "/plan/balls", balls, zero_m, on_click)
+    plan_colours = np.array(ball_colours, dtype=np.uint8)
+    _draw_balls(scene, "/plan/balls", sites, plan_colours, _PLAN_RADIUS_M, zero_m, on_click)
     for number, (site, label) in enumerate(zip(sites, labels, strict=True)):
         if site.name == selected:
             continue
@@ -363,21 +362,22 @@ def linear_colours(colours: ArrayLike) -> Bytes:
     return np.round(255.0 * linear).astype(np.uint8)
 
 
-class _Balls(NamedTuple):
-    """Sites, their colours (n, 3), and the radius of all balls."""
-
-    sites: list[Site]
-    colours: Bytes
-    radius_m: float
-
-
-def _draw_balls(scene: viser.SceneApi, name: str, balls: _Balls, zero_m: Vec3, on_click: OnClick | None) -> None:
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=balls.radius_m)
+def _draw_balls(
+    scene: viser.SceneApi,
+    name: str,
+    sites: Sequence[Site],
+    colours: Bytes,
+    radius_m: float,
+    zero_m: Vec3,
+    on_click: OnClick | None,
+) -> None:
+    """Draw a ball for each site, in its colour, (n, 3)."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=radius_m)
     handle = scene.add_batched_meshes_simple(
         name, np.asarray(ball.vertices, dtype=np.float32), np.asarray(ball.faces, dtype=np.int32),
-        batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(balls.sites), 1)),
-        batched_positions=np.array([site.pose.position_m for site in balls.sites]) - zero_m,
-        batched_colors=linear_colours(balls.colours), lod="off",
+        batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(sites), 1)),
+        batched_positions=np.array([site.pose.position_m for site in sites]) - zero_m,
+        batched_colors=linear_colours(colours), lod="off",
     )  # fmt: skip
     if on_click is None:
         return
@@ -385,7 +385,7 @@ def _draw_balls(scene: viser.SceneApi, name: str, balls: _Balls, zero_m: Vec3, o
     @handle.on_click
     def _(event: viser.SceneNodePointerEvent[viser.BatchedMeshHandle]) -> None:
         if event.instance_index is not None:
-            on_click(balls.sites[event.instance_index])
+            on_click(sites[event.instance_index])
 
 
 _LENGTH_DIGITS, _ANGLE_DIGITS = 3, 2

@@ -119,7 +119,7 @@ def write_page_file(session: Session, path: Path, progress: ProgressCallback = n
     if plan is not None:
         ratings = [session.rate(site.name, site.pose, site.sensor) for site in plan.sites.values()]
     clip = TrafficClip.of(playback, [rating.site for rating in ratings], progress)
-    guard = AccessGuard(_no_query)  # the server is only used to record: nobody has its key
+    guard = AccessGuard(lambda _: {})  # the server is only used to record: nobody has its key
     server = start_server(guard)
     try:
         html, panel = _record(server, session, playback, plan, ratings[0], clip)
@@ -131,10 +131,6 @@ def write_page_file(session: Session, path: Path, progress: ProgressCallback = n
     drawn = sum(len(points[:: clip.returns_step]) for points in clip.returns_m)
     names = tuple(rating.site.name for rating in ratings)
     return PageFile(path, path.stat().st_size, names, clip.duration_s, returns, drawn)
-
-
-def _no_query(_: dict[str, str]) -> dict[str, str]:
-    return {}
 
 
 def _record(

@@ -21,7 +21,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -318,22 +318,15 @@ def load_clean_mesh(path: Path, most_m: float) -> tuple[trimesh.Trimesh, int]:
     return mesh, triangles - len(mesh.faces)
 
 
-class MeshPieces(NamedTuple):
-    """Triangles of a mesh: of each closed component by its number, and of all others together, (n,) int64 each."""
-
-    closed: dict[int, IntArray]
-    open: IntArray
-
-
-def divide_mesh(mesh: trimesh.Trimesh) -> MeshPieces:
-    """Divide a mesh into its closed components and the rest."""
+def divide_mesh(mesh: trimesh.Trimesh) -> tuple[dict[int, IntArray], IntArray]:
+    """Return the triangles of each closed component by its number, and all others, (n,) int64 each."""
     faces = np.asarray(mesh.faces, dtype=np.int64)
     component = mesh_components(mesh.face_adjacency, len(faces))
     is_closed = are_closed(faces, component)
     order = np.argsort(component, kind="stable")
     by_component = np.split(order, np.cumsum(np.bincount(component))[:-1])
     closed = {number: by_component[number] for number in np.flatnonzero(is_closed).tolist()}
-    return MeshPieces(closed, order[~is_closed[component[order]]])
+    return closed, order[~is_closed[component[order]]]
 
 
 def mesh_components(adjacent: IntArray, triangles: int) -> IntArray:

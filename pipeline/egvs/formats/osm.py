@@ -11,7 +11,6 @@ https://wiki.openstreetmap.org/wiki/Map_features.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from egvs.core import files, limits
 from egvs.core.errors import InputError
+from egvs.core.numbers import number_or_nan
 from egvs.core.reading import COMPLETE_FILE, translate_errors
 from egvs.formats import xml
 from egvs.formats.xml import PARSER_ENCODINGS
@@ -284,10 +284,7 @@ def _parse_integer(path: Path, key: str, text: str | None) -> int:
 
 
 def _check_degrees(path: Path, key: str, text: str | None, limit: float) -> None:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
+    value = number_or_nan(text or "")
     if not abs(value) <= limit:
         problem = f"expected degrees from {-limit:g} to {limit:g}, got {text!r}"
         raise InputError(f"{path}: {key}", problem, _VALUE_HINT)

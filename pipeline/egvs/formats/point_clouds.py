@@ -88,23 +88,8 @@ class StreamedFormat(PointFormat, Protocol):
         """Yield the points in the file's order; InputError at ``where`` when the file is damaged."""
 
 
-class PointCloud(NamedTuple):
-    """The points of a file.
-
-    Attributes
-    ----------
-    points_m
-        The finite points, in the file's order, (n, 3) float64, n >= 1.
-    dropped
-        Number of further points, NaN or infinite.
-    """
-
-    points_m: FloatArray
-    dropped: int
-
-
-def read_points(path: Path, where: str) -> PointCloud:
-    """Read a point cloud.
+def read_points(path: Path, where: str) -> tuple[FloatArray, int]:
+    """Return the finite points of a file, in its order, (n, 3) float64, n >= 1, and how many others it has.
 
     Parameters
     ----------
@@ -128,7 +113,7 @@ def read_points(path: Path, where: str) -> PointCloud:
     if dropped == len(points):
         problem = f"expected at least one return with finite x, y and z, got none of {len(points)}"
         raise InputError(where, problem, COMPLETE_FILE)
-    return PointCloud(points[finite] if dropped else points, dropped)
+    return points[finite] if dropped else points, dropped
 
 
 def _read_all(path: Path, where: str) -> FloatArray:

@@ -28,7 +28,7 @@ from egvs.placement import fused_score, problem_builder, refinement, solver
 from egvs.placement.fused_score import FusedScore
 from egvs.placement.plan_error import PlanErrors
 from egvs.placement.plan_zones import PlanZones
-from egvs.placement.problem import Problem
+from egvs.placement.problem import Demand, Problem
 from egvs.placement.problem_builder import PlacementProblem, TargetView
 from egvs.placement.refinement import PlanPoses
 from egvs.placement.solver import Solution
@@ -280,7 +280,7 @@ def solve_placement(context: StageContext, *, exact: bool, time_limit_s: float) 
     if config.reach is None:
         solution = solver.best_plan(problem, search_all=exact, time_limit_s=time_limit_s, on_progress=on_progress)
     else:
-        reach = problem_builder.share_demand(problem, config.reach, placement_problem.joint_of_all)
+        reach = Demand(problem.joint, config.reach * placement_problem.joint_of_all)
         problem = replace(problem, demands=(*problem.demands, reach))
         smallest = solver.smallest_plan(problem, time_limit_s=time_limit_s, on_progress=on_progress)
         if smallest is None:

@@ -604,8 +604,3 @@ def _check_cost(where: str, cost: float) -> None:
     """Raise InputError for a cost so large that sums of costs lose the small ones, or overflow."""
     if not cost <= _MAX_COST:
         raise InputError(where, f"expected at most {_MAX_COST:g}, got {cost:g}", "Use a larger currency unit.")
-
-
-def share_demand(problem: Problem, share: float, joint_of_all: float) -> Demand:
-    """Return the demand that a plan reaches a share of the joint score of all candidates."""
-    return Demand(problem.joint, share * joint_of_all)

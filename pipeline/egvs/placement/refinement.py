@@ -22,7 +22,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -310,12 +310,13 @@ def _sensor_freedom(
 
     line_position = _position_on_line(scenario.sites.along, pose)
     if line_position is not None:
-        reach_m = line_position.spacing_m / 2.0 if config.radius_m is None else config.radius_m
-        low_m = max(line_position.along_m - reach_m, 0.0)
-        high_m = min(line_position.along_m + reach_m, line_position.line.length)
+        line, along_m, spacing_m = line_position
+        reach_m = spacing_m / 2.0 if config.radius_m is None else config.radius_m
+        low_m = max(along_m - reach_m, 0.0)
+        high_m = min(along_m + reach_m, line.length)
         if not low_m < high_m:
             return Freedom(pose, tuple(mount_axes))
-        return Freedom(pose, (Axis(_ALONG_AXIS, low_m, high_m), *mount_axes), line=line_position.line)
+        return Freedom(pose, (Axis(_ALONG_AXIS, low_m, high_m), *mount_axes), line=line)
 
     radius_m = config.radius_m
     if radius_m:
@@ -336,16 +337,8 @@ def _containing_area(config: RefinementConfig, pose: Pose) -> BaseGeometry | Non
     return None
 
 
-class LinePosition(NamedTuple):
-    """Position of a pole on a line of sites."""
-
-    line: LineString
-    along_m: float
-    spacing_m: float
-
-
-def _position_on_line(rules: Sequence[SiteLine], pose: Pose) -> LinePosition | None:
-    """Where a pole is on the line of the rule that created it."""
+def _position_on_line(rules: Sequence[SiteLine], pose: Pose) -> tuple[LineString, float, float] | None:
+    """The line of the rule that created a pole, where the pole is on it, and the spacing of its poles, metres."""
     import shapely
 
     for rule in rules:
@@ -355,7 +348,7 @@ def _position_on_line(rules: Sequence[SiteLine], pose: Pose) -> LinePosition | N
         poles_m = shapely.get_coordinates(shapely.line_interpolate_point(line, along_m))
         distance_m = np.hypot(*(poles_m - (pose.x_m, pose.y_m)).T)
         if distance_m.min() <= _ON_LINE_M:
-            return LinePosition(line, float(along_m[np.argmin(distance_m)]), rule.spacing_m)
+            return line, float(along_m[np.argmin(distance_m)]), rule.spacing_m
     return None
 
 

@@ -66,10 +66,6 @@ _TRAFFIC = re.compile(r"\btraffic\b(?! (?:light|sign))", re.IGNORECASE)
 """Found in entries of the key ``assumed`` on traffic; traffic lights and signs are not traffic."""
 
 
-def _read_base64(path: Path) -> str:
-    return base64.b64encode(path.read_bytes()).decode("ascii")
-
-
 # ---- what the ranking rests on
 
 
@@ -337,4 +333,5 @@ def study_values(folder: RunFolder, stages: Mapping[str, StageRecord]) -> dict[s
     tolerance = f"{study.tolerance.loss_points:g} percentage points of vehicles found"
     if study.tolerance.score is not None:
         tolerance = f"{100 * study.tolerance.score:g} % of the score"
-    return {"study": study, "study_tolerance": tolerance, "study_figure": _read_base64(folder.accuracy_figure)}
+    figure = base64.b64encode(folder.accuracy_figure.read_bytes()).decode("ascii")
+    return {"study": study, "study_tolerance": tolerance, "study_figure": figure}

@@ -464,7 +464,7 @@ def lock_run_folder(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
         When another run is still at work there.
     """
     store.check_outside_store(folder)
-    created = _missing_folders(folder)
+    created = [path for path in (folder, *folder.parents) if not path.exists()]  # the innermost first
     descriptor = _lock_folder(folder, wait_s)
     try:
         yield
@@ -493,11 +493,6 @@ def _open_folder_lock(folder: Path) -> int:
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"
         raise InputError(folder, problem, "Choose a folder that you may write to.") from None
-
-
-def _missing_folders(folder: Path) -> list[Path]:
-    """Return the folder and its parents as far as they do not exist, the innermost first."""
-    return [path for path in (folder, *folder.parents) if not path.exists()]
 
 
 def _remove_unused(folder: Path, created: Sequence[Path]) -> None:

@@ -65,17 +65,6 @@ def stage(name: str) -> Stage:
     return described
 
 
-def stages_without_traffic() -> tuple[str, ...]:
-    """Return the stages that need neither recorded traffic nor an artefact of a stage that does, in order."""
-    names: list[str] = []
-    for name in STAGE_NAMES:
-        described = stage(name)
-        makers = {file.writer for file in described.reads}
-        if not described.reads_traffic and makers <= set(names):
-            names.append(name)
-    return tuple(names)
-
-
 def written_by(name: str) -> tuple[str, ...]:
     """Return the files that a stage can write, and the folders that it writes beside them."""
     return tuple(file.name for file in RunFolder.written_by(name))

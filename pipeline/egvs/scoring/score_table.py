@@ -28,7 +28,6 @@ from egvs.scenario.model import SCENARIO_FILE
 from egvs.scoring.scorer import SiteScore, ranks
 from egvs.scoring.standard_errors import BlockGroups, LagBehindBest, ScoreUncertainty, beats_next, lag_behind_best
 from egvs.scoring.target_scores import SiteTargetScores
-from egvs.statistics.ranks import rank_order
 
 MIX = ""
 """Period of the scores over all traffic: the mix of the periods where there are some."""
@@ -155,14 +154,6 @@ class ScoreColumn:
         return frozenset(np.flatnonzero(self.values == self.values.max()).tolist())
 
 
-class RankingRow(NamedTuple):
-    """A site with its rank by some score."""
-
-    rank: int
-    site: str
-    value: float
-
-
 @dataclass(frozen=True, eq=False)
 class ScoreTable:
     """The scores of all sites.
@@ -239,13 +230,6 @@ class ScoreTable:
     def by_period(self, score: str) -> dict[str, ScoreColumn]:
         """Return one score of all sites in each period."""
         return {period: self.column(score, period) for period in self.periods}
-
-    def ranking(self, score: str, period: str = MIX) -> list[RankingRow]:
-        """Return the sites from best to worst by one score; equal ones in the order of the table."""
-        column = self.column(score, period)
-        rank = column.rank
-        order = rank_order(column.values).tolist()
-        return [RankingRow(int(rank[i]), self.sites[i], float(column.values[i])) for i in order]
 
 
 def write_scores_by_period(

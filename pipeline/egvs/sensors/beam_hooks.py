@@ -39,11 +39,9 @@ class BeamExpander(Protocol):
     @property
     def copies(self) -> int:
         """Number of sub-beams per beam."""
-        raise NotImplementedError
 
     def expand(self, directions: FloatArray, sensor: Sensor, pose: Pose) -> SubBeams:
         """Return the sub-beams of beams ``directions`` (n, 3) of a sensor that is mounted at ``pose``."""
-        raise NotImplementedError
 
 
 @runtime_checkable
@@ -52,7 +50,6 @@ class BeamCutter(Protocol):
 
     def opaque(self, world: World) -> World:
         """Return the world without the surfaces that this effect lets beams through."""
-        raise NotImplementedError
 
     def cutter(self, world: World, roi: Roi) -> Callable[[EmptyScan, Pose], EmptyScan]:
         """Return a function that cuts a scan, cast at :meth:`opaque`, into weighted parts; threads may share it.
@@ -60,4 +57,3 @@ class BeamCutter(Protocol):
         Each part is a beam from the sensor that ends where that share of the beam ends. The weights of a beam still add
         up to what they were, and the hits of a voxel are the share that gets as far.
         """
-        raise NotImplementedError

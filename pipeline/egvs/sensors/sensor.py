@@ -39,7 +39,7 @@ from egvs.core import files, limits
 from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.numbers import parse_decimal
+from egvs.core.numbers import number_or_nan, parse_decimal
 from egvs.core.special import cosdg, sindg
 from egvs.scenario.model import Scenario
 from egvs.scenario.sensor_config import BeamPatternConfig, SensorConfig
@@ -165,10 +165,7 @@ def _check_beam_columns(path: Path, names: list[str]) -> None:
 
 def _parse_angle(path: Path, number: int, column: str, text: str | None) -> float:
     limit_deg = _MAX_ANGLE_DEG[column]
-    try:
-        angle = parse_decimal(text or "")
-    except ValueError:
-        angle = math.nan
+    angle = number_or_nan(text or "", parse_decimal)
     if not abs(angle) <= limit_deg:
         problem = f"expected a number between {-limit_deg:g} and {limit_deg:g}, got {text!r}"
         raise InputError(f"{path}: beam {number}: {column}", problem)

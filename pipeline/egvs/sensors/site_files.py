@@ -181,7 +181,7 @@ def _feature_columns(where: str, feature: Any, reading: CoordinateReading) -> di
             continue
         if isinstance(value, str) and key != "site":
             raise InputError(f"{where}: {key}", f"expected a numeric coordinate, got the text {value!r}")
-        difference_m = abs(_number_or_nan(row.get(key)) - _number_or_nan(value))
+        difference_m = abs(number_or_nan(row.get(key)) - number_or_nan(value))
         if reading.convert is not None and difference_m <= _TOLERANCE_M:
             continue  # a GIS carried the unrounded value along as a property: keep it
         if row.get(key, value) not in (None, value):
@@ -194,8 +194,8 @@ def _point_to_world(point: list[Any], reading: CoordinateReading) -> list[Any]:
     """A point's coordinates with x, y in the world frame; values that are no numbers are rejected later."""
     if reading.convert is None or any(isinstance(value, str | bool) for value in point[:2]):
         return point
-    x = _number_or_nan(point[0])
-    y = _number_or_nan(point[1])
+    x = number_or_nan(point[0])
+    y = number_or_nan(point[1])
     if not math.isfinite(x + y):
         return point
     return [*reading.to_world(np.array([[x, y]]))[0].tolist(), *point[2:]]
@@ -214,7 +214,7 @@ def rows_in_world_frame(rows: Iterable[SiteRow], path: object, world: Georeferen
     """
     rows = list(rows)
     names = [_lon_lat_columns(row.columns) for row in rows]
-    metres = [(_number_or_nan(row.columns.get("x_m")), _number_or_nan(row.columns.get("y_m"))) for row in rows]
+    metres = [(number_or_nan(row.columns.get("x_m")), number_or_nan(row.columns.get("y_m"))) for row in rows]
     plausible = [(x, y) for x, y in metres if abs(x) <= _MAX_M and abs(y) <= _MAX_M]
     world.check_metres(_as_points(plausible), str(path), _COLUMNS_HINT)
     if not any(names):
@@ -257,10 +257,10 @@ def _parse_lon_lat(row: SiteRow, columns: tuple[str, str] | None) -> tuple[float
     lon, lat = columns
     for name, limit_deg in ((lon, 180.0), (lat, 90.0)):
         value = row.columns[name]
-        if not abs(_number_or_nan(value)) <= limit_deg:
+        if not abs(number_or_nan(value)) <= limit_deg:
             problem = f"expected degrees from {-limit_deg:g} to {limit_deg:g}, got {repr(value)[:80]}"
             raise InputError(f"{row.where}: {name}", problem)
-    return _number_or_nan(row.columns[lon]), _number_or_nan(row.columns[lat])
+    return number_or_nan(row.columns[lon]), number_or_nan(row.columns[lat])
 
 
 def _row_to_world(row: SiteRow, lon_lat: tuple[float, float] | None, reading: CoordinateReading) -> dict[str, float]:
@@ -268,7 +268,7 @@ def _row_to_world(row: SiteRow, lon_lat: tuple[float, float] | None, reading: Co
     if lon_lat is None:
         return {}
     x_m, y_m = reading.to_world(np.array([lon_lat]))[0].tolist()
-    stated = (_number_or_nan(row.columns.get("x_m")), _number_or_nan(row.columns.get("y_m")))
+    stated = (number_or_nan(row.columns.get("x_m")), number_or_nan(row.columns.get("y_m")))
     if not math.isfinite(sum(stated)):
         return {"x_m": x_m, "y_m": y_m}
     distance_m = math.dist(stated, (x_m, y_m))
@@ -284,13 +284,14 @@ def _row_to_world(row: SiteRow, lon_lat: tuple[float, float] | None, reading: Co
 def row_position_m(row: SiteRow) -> tuple[float, float]:
     """Return x_m and y_m of a row (world frame, metres); InputError where one is missing or not a number."""
     for key in ("x_m", "y_m"):
-        if not math.isfinite(_number_or_nan(row.columns.get(key))):
+        if not math.isfinite(number_or_nan(row.columns.get(key))):
             problem = f"expected metres, got {row.columns.get(key)!r}"
             raise InputError(f"{row.where}: {key}", problem, _COLUMNS_HINT)
-    return _number_or_nan(row.columns["x_m"]), _number_or_nan(row.columns["y_m"])
+    return number_or_nan(row.columns["x_m"]), number_or_nan(row.columns["y_m"])
 
 
-def _number_or_nan(value: Any) -> float:
+def number_or_nan(value: Any) -> float:
+    """Return a number, or a text that is one, as a float; NaN for everything else."""
     try:
         return parse_decimal(value) if isinstance(value, str) else float(value)
     except (TypeError, ValueError, OverflowError):

@@ -27,14 +27,13 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
 from egvs.core import polylines
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, unknown_site
 from egvs.core.grid import Vec3
-from egvs.core.numbers import parse_decimal
 from egvs.core.special import cosdg, sindg
 from egvs.core.wording import list_first
 from egvs.formats import vector_files
@@ -287,13 +286,6 @@ class Mount:
     pitch_deg: float
 
 
-class AimingAngles(NamedTuple):
-    """Yaw and pitch at which a sensor's middle ray meets its target, degrees."""
-
-    yaw_deg: float
-    pitch_deg: float
-
-
 class _SiteBuilder:
     """Makes the candidates of one row after another.
 
@@ -391,13 +383,13 @@ class _SiteBuilder:
         return default_deg if isinstance(default_deg, tuple) else (default_deg,)
 
     def _angles(
-        self, where: str, request: MountRequest, pitch: Pitch, aimed: AimingAngles | None
+        self, where: str, request: MountRequest, pitch: Pitch, aimed: tuple[float, float] | None
     ) -> tuple[float, float]:
         """Yaw and pitch of a mount, degrees."""
         if aimed is not None and pitch == "aim":
-            return aimed.yaw_deg, aimed.pitch_deg
+            return aimed
         if aimed is not None:
-            return aimed.yaw_deg, float(pitch)
+            return aimed[0], float(pitch)
         if pitch == "aim":
             reason = "there is no aim"
             if request.yaw_deg is not None:
@@ -424,8 +416,8 @@ def _name_suffix(z_m: float, pitch: Pitch, *, with_height: bool, with_pitch: boo
     return "@" + suffix.removeprefix("+") if suffix else ""
 
 
-def aiming_angles(where: str, from_m: Vec3, to_m: Vec3, roll_deg: float, sensor: Sensor) -> AimingAngles:
-    """Return yaw and pitch at which the middle ray of a sensor meets a point; equations in the module's docstring.
+def aiming_angles(where: str, from_m: Vec3, to_m: Vec3, roll_deg: float, sensor: Sensor) -> tuple[float, float]:
+    """Return yaw and pitch, degrees, at which the middle ray of a sensor meets a point; see the module's docstring.
 
     Parameters
     ----------
@@ -462,7 +454,7 @@ def aiming_angles(where: str, from_m: Vec3, to_m: Vec3, roll_deg: float, sensor:
         raise InputError(f"{where}: aim", problem, hint)
     yaw_deg = math.degrees(math.atan2(y, x) - math.atan2(middle_y, forward))
     yaw_deg = round(math.remainder(yaw_deg, 360.0), _ANGLE_DIGITS) + 0.0
-    return AimingAngles(yaw_deg, round(pitch_deg, _ANGLE_DIGITS) + 0.0)
+    return yaw_deg, round(pitch_deg, _ANGLE_DIGITS) + 0.0
 
 
 def _rotate_around_x(middle_deg: tuple[float, float], roll_deg: float) -> Vec3:
@@ -536,22 +528,11 @@ def _row_aim_m(row: SiteRow, numbers: Mapping[str, float], scenario: Scenario) -
 
 
 def _parse_number(where: str, key: str, value: Any) -> float:
-    try:
-        number = parse_decimal(value) if isinstance(value, str) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
+    number = site_files.number_or_nan(value)
     if not abs(number) <= MAX_COORDINATE_M or isinstance(value, bool):
         problem = f"expected a finite number of at most {MAX_COORDINATE_M:g}, got {repr(value)[:80]}"
         raise InputError(f"{where}: {key}", problem)
     return number
-
-
-class _RulePoint(NamedTuple):
-    """A point of a rule, world frame, with the heights of the rule."""
-
-    x_m: float
-    y_m: float
-    heights_m: tuple[float, ...]
 
 
 def _grid_rows(rule: SiteGrid) -> Iterator[SiteRow]:
@@ -564,12 +545,12 @@ def _grid_rows(rule: SiteGrid) -> Iterator[SiteRow]:
         axes.append([low + i * rule.spacing_m for i in range(count)])
     xs, ys = axes
     site_files.check_site_count(len(xs) * len(ys), "sites.grid", reason)
-    points = [_RulePoint(x, y, rule.heights_m) for y in ys for x in xs]
+    points = [(x, y, rule.heights_m) for y in ys for x in xs]
     yield from _numbered_rows("g", points, "sites.grid")
 
 
 def _line_rows(rules: tuple[SiteLine, ...]) -> Iterator[SiteRow]:
-    points: list[_RulePoint] = []
+    points: list[tuple[float, float, tuple[float, ...]]] = []
     for rule in rules:
         reason = f"spacing_m = {rule.spacing_m:g}"
         line = np.asarray(rule.line_m)
@@ -578,12 +559,13 @@ def _line_rows(rules: tuple[SiteLine, ...]) -> Iterator[SiteRow]:
         count = math.floor(stations_m[-1] / rule.spacing_m + 1e-9) + 1
         site_files.check_site_count(len(points) + count, "sites.along", reason)
         at_m = np.arange(count) * rule.spacing_m
-        points += [_RulePoint(float(x), float(y), rule.heights_m) for x, y in polylines.points_at(line, at_m)]
+        points += [(float(x), float(y), rule.heights_m) for x, y in polylines.points_at(line, at_m)]
     yield from _numbered_rows("a", points, "sites.along")
 
 
-def _numbered_rows(letter: str, points: list[_RulePoint], where: str) -> Iterator[SiteRow]:
+def _numbered_rows(letter: str, points: list[tuple[float, float, tuple[float, ...]]], where: str) -> Iterator[SiteRow]:
+    """Yield a row for each point of a rule, given by x, y and heights in metres."""
     width = max(2, len(str(len(points))))
-    for number, point in enumerate(points, start=1):
+    for number, (x_m, y_m, heights_m) in enumerate(points, start=1):
         name = f"{letter}{number:0{width}d}"
-        yield SiteRow(f"{where}: {name}", {"site": name, "x_m": point.x_m, "y_m": point.y_m}, point.heights_m)
+        yield SiteRow(f"{where}: {name}", {"site": name, "x_m": x_m, "y_m": y_m}, heights_m)

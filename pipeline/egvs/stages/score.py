@@ -224,7 +224,7 @@ def _summary(
     ranking = scores.column(config.rank_by)
     best = []
     if np.any(ranking.values > 0):
-        best = [site.site for site in scores.ranking(config.rank_by) if site.rank == 1]
+        best = [scores.sites[i] for i in np.flatnonzero(ranking.rank == 1)]
     summary: Summary = {"sites": len(sites), "best": best, "rank_by": config.rank_by, "egvs_limit": limit}
     if config.weights.are_given:
         summary["weights"] = config.weights.in_words

@@ -500,9 +500,9 @@ def compare_rankings(a: ComparedRun, b: ComparedRun, by: View = "site") -> RankA
     shared = [key for key in ranked_a if key in ranked_b]
     if not shared:
         return RankAgreement(a.label, b.label, 0)
-    scores_a = np.array([ranked_a[key].score for key in shared])
-    scores_b = np.array([ranked_b[key].score for key in shared])
-    names = [ranked_a[key].name for key in shared]
+    scores_a = np.array([ranked_a[key][1] for key in shared])
+    scores_b = np.array([ranked_b[key][1] for key in shared])
+    names = [ranked_a[key][0] for key in shared]
     tau, rho = None, None
     if len(shared) > 1:
         tau = rank_agreement(scores_a, scores_b, "tau")
@@ -512,17 +512,11 @@ def compare_rankings(a: ComparedRun, b: ComparedRun, by: View = "site") -> RankA
     return RankAgreement(a.label, b.label, len(shared), tau, rho, best_a, best_b, regret(scores_a, scores_b))
 
 
-class _RankedName(NamedTuple):
-    """Name and score of a pole, or of a site."""
-
-    name: str
-    score: float
-
-
-def _ranked(run: ComparedRun, by: View) -> dict[Location | str, _RankedName]:
+def _ranked(run: ComparedRun, by: View) -> dict[Location | str, tuple[str, float]]:
+    """Return name and score of each pole, or of each site."""
     if by == "pole":
-        return {location: _RankedName(pole.name, pole.best.score) for location, pole in run.poles.items()}
-    return {name: _RankedName(name, site.score) for name, site in run.sites.items()}
+        return {location: (pole.name, pole.best.score) for location, pole in run.poles.items()}
+    return {name: (name, site.score) for name, site in run.sites.items()}
 
 
 def find_differences(runs: Sequence[ComparedRun]) -> Iterator[Difference]:

@@ -31,7 +31,7 @@ import numpy as np
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.numbers import parse_decimal
+from egvs.core.numbers import number_or_nan, parse_decimal
 from egvs.core.platform import relative_path
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.special import cosdg, sindg
@@ -468,10 +468,7 @@ def _check_vehicle_columns(path: Path, header: list[str]) -> list[str]:
 
 
 def _parse(text: str, where: str) -> float:
-    try:
-        value = parse_decimal(text)
-    except ValueError:
-        value = math.nan
+    value = number_or_nan(text, parse_decimal)
     if not abs(value) <= MAX_COORDINATE_M:
         raise InputError(where, f"expected a number, got {text!r}", "Use decimal points, not decimal commas.")
     return value

@@ -43,15 +43,6 @@ def approach_name(side: str, street: str) -> str:
     return f"{street} ({side})" if street and side else street or side
 
 
-def crosswalk_name(approach: str) -> str:
-    """Return the name of the crosswalk over the arm of an approach.
-
-    >>> crosswalk_name(approach_name("north", "North Street"))
-    'North Street (north) crosswalk'
-    """
-    return f"{approach} crosswalk"
-
-
 def plain_text(name: str) -> str:
     """Return a name of a network on one line; netconvert escapes names twice."""
     printable = (character if character.isprintable() else " " for character in html.unescape(name))
@@ -150,7 +141,7 @@ class ApproachNames:
 
     def crosswalk(self, crossing_id: str) -> str:
         """Return the name of a crossing, e.g. ``"North Street (north) crosswalk"``."""
-        return crosswalk_name(self.crossed_arm(crossing_id).name)
+        return f"{self.crossed_arm(crossing_id).name} crosswalk"
 
     def _line_back(self, edge_id: str) -> Floats:
         """Return a line from the end of an edge backwards, (n, 2), over :data:`HEADING_OVER_M`."""

@@ -11,11 +11,6 @@ that was carried and the smallest that was not. A share is carried if, in a simu
 The simulation is coarse (steps of 0.5 s, no sublanes) and short, so queues that grow slowly do not show. Of a share
 below 1, :data:`RESERVE` is therefore used. Rare locks do not show either.
 
-For a whole town, :func:`find_flow` finds how many random trips per hour it carries: no vehicle stands for long, all
-find space to start, and less than :data:`MAX_QUEUING` of them stand beyond those that also stand in light traffic.
-Vehicles per kilometre of lane would be the wrong measure: most streets are residential, and all trips use a few main
-roads.
-
 The same network and flows give the same result.
 """
 
@@ -23,7 +18,6 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,9 +28,9 @@ import numpy as np
 from egvs.core import files
 from egvs.formats import xml
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
-from egvs.traffic import demand, sumo, sumo_folder, town_trips
+from egvs.traffic import demand, sumo, sumo_folder
 from egvs.traffic.locks import MOVED_M, SAMPLE_S, StreetNames
-from egvs.traffic.network import Edge, Network, read_net_xml
+from egvs.traffic.network import Network, read_net_xml
 
 DURATION_S, WARMUP_S = 900.0, 300.0
 STEP_S = 0.5
@@ -48,32 +42,11 @@ MIN_ARRIVED = 0.9
 MAX_RUNS = 6
 RESERVE = 0.92
 
-FLOW_DURATION_S, FLOW_WARMUP_S, FLOW_STEP_S = 1500.0, 600.0, 1.0
-"""Simulations of whole towns."""
-
-LANE_PER_H, FIRST_LOAD = 1800, 0.6
-"""Vehicles that a lane passes per hour, and the load of the busiest junction in the first simulation of a town."""
-
-FLOW_FACTOR = 1.25
-"""From one simulation of a town to the next, its flow is raised or lowered by this factor."""
-
-MAX_FLOW_RUNS = 6
-"""Maximum number of simulations of a town, without that of light traffic."""
-
-MAX_QUEUING = 0.15
-"""Maximum share of the vehicles that stand, beyond the share that stands in light traffic."""
-
-LIGHT_SHARE = 0.1
-"""Light traffic is this share of the first flow."""
-
-_LOAD_TRIPS, _MIN_LIGHT_PER_H = 3000, 100
 
 _FACTOR = 0.7
 _CLOSE_ENOUGH = 1.06
 """The trial ends when the shares that are and are not carried differ by less than this factor."""
 
-_TRIAL_WHERE = "random trips"
-"""In messages, instead of the traffic table of a scenario."""
 
 _FCD_FILE, _TRIPS_FILE, _STATISTICS_FILE = "trial.csv", "arrivals.xml", "statistics.xml"
 
@@ -212,17 +185,16 @@ def _simulate(
     routes = folder / sumo_folder.TRIPS_FILE
     demand.write_routes(traffic, roads, (0.0, DURATION_S), seed, routes, "assumed flows")
     files.write_text(folder / sumo_folder.VTYPES_FILE, demand.vtypes_xml(traffic.kinds))
-    state = _run_sumo(folder, DURATION_S, WARMUP_S, {"ignore-junction-blocker": f"{junction_blocker_s:g}"})
+    stand, waiting = run_sumo(folder, DURATION_S, WARMUP_S, {"ignore-junction-blocker": f"{junction_blocker_s:g}"})
     scheduled, arrived = _arrivals(routes, folder / _TRIPS_FILE)
-    stand = state.standing
     location = ""
     if stand.at_m is not None:
         x_m, y_m = stand.at_m
         location = f"{StreetNames(roads).at(stand.at_m)} (x {x_m:.0f} m, y {y_m:.0f} m) from {stand.since_s:.0f} s on"
-    return TrialRun(share, scheduled, arrived, stand.longest_s, state.waiting, location)
+    return TrialRun(share, scheduled, arrived, stand.longest_s, waiting, location)
 
 
-class _Standing(NamedTuple):
+class StandingVehicles(NamedTuple):
     """Vehicles that stand.
 
     The longest time that one stood, the share of vehicles that stand in a sample, where the first one stood (None if
@@ -235,15 +207,10 @@ class _Standing(NamedTuple):
     since_s: float = 0.0
 
 
-class _SimulationResult(NamedTuple):
-    """The vehicles that stand in a simulation, and the number of those without space to start."""
-
-    standing: _Standing
-    waiting: int
-
-
-def _run_sumo(folder: Path, duration_s: float, warmup_s: float, options: Mapping[str, str]) -> _SimulationResult:
-    """Simulate the routes in a folder."""
+def run_sumo(
+    folder: Path, duration_s: float, warmup_s: float, options: Mapping[str, str]
+) -> tuple[StandingVehicles, int]:
+    """Simulate the routes in a folder; return the vehicles that stand, and how many have no space to start."""
     all_options = {
         "net-file": sumo_folder.NETWORK_FILE,
         "additional-files": sumo_folder.VTYPES_FILE,
@@ -267,7 +234,7 @@ def _run_sumo(folder: Path, duration_s: float, warmup_s: float, options: Mapping
     }
     sumo.run_program("sumo", sumo_folder.as_flags(all_options), folder)
     (vehicles,) = (e for e in xml.iter_elements(folder / _STATISTICS_FILE, "statistics") if e.tag == "vehicles")
-    return _SimulationResult(_standing(folder / _FCD_FILE), int(vehicles.get("waiting", 0)))
+    return _standing(folder / _FCD_FILE), int(vehicles.get("waiting", 0))
 
 
 def _arrivals(routes: Path, trips: Path) -> tuple[int, int]:
@@ -283,16 +250,16 @@ def _arrivals(routes: Path, trips: Path) -> tuple[int, int]:
     return scheduled, len(durations_s)
 
 
-def _standing(fcd: Path) -> _Standing:
+def _standing(fcd: Path) -> StandingVehicles:
     """Return for how long and where a vehicle stood at most, and the share of vehicles that stand in a sample."""
     lines = fcd.read_text(encoding="utf-8").splitlines()
     header = lines[0].split(";") if lines else []
     if len(lines) < 2:
-        return _Standing(0.0, 0.0)
+        return StandingVehicles(0.0, 0.0)
     column = {name: header.index(name) for name in ("timestep_time", "vehicle_id", "vehicle_x", "vehicle_y")}
     last: dict[str, tuple[float, float, float]] = {}
     """Time since when each vehicle stands, and where."""
-    longest = _Standing(0.0, 0.0)
+    longest = StandingVehicles(0.0, 0.0)
     rows, standing = 0, 0
     for line in lines[1:]:
         values = line.split(";")
@@ -305,166 +272,7 @@ def _standing(fcd: Path) -> _Standing:
             since_s, old_x_m, old_y_m = time_s, x_m, y_m
         last[name] = since_s, old_x_m, old_y_m
         if time_s - since_s > longest.longest_s:
-            longest = _Standing(time_s - since_s, 0.0, (old_x_m, old_y_m), since_s)
+            longest = StandingVehicles(time_s - since_s, 0.0, (old_x_m, old_y_m), since_s)
         rows += 1
         standing += time_s > since_s
     return longest._replace(share_at_rest=standing / max(rows, 1))
-
-
-@dataclass(frozen=True)
-class FlowTrial:
-    """A simulation of a whole town.
-
-    Attributes
-    ----------
-    vehicles_per_h
-        Vehicles that start per hour.
-    reroute
-        As ``traffic.reroute_at_departure``.
-    longest_standing_s
-        Longest time that a vehicle stood.
-    waiting
-        Vehicles without space to start, at the end.
-    share_queuing
-        Share of the vehicles that stand, in the mean over time, beyond the share in light traffic, which stands at
-        red signals.
-    """
-
-    vehicles_per_h: int
-    reroute: bool
-    longest_standing_s: float
-    waiting: int
-    share_queuing: float
-
-    @property
-    def is_carried(self) -> bool:
-        """Whether the town carries this flow."""
-        stands = self.longest_standing_s > MAX_STANDING_S
-        return not stands and self.waiting < MAX_WAITING and self.share_queuing < MAX_QUEUING
-
-
-@dataclass(frozen=True)
-class FlowCapacity:
-    """The flow that a town carries, whether it needs ``traffic.reroute_at_departure``, and the trial's simulations."""
-
-    vehicles_per_h: int
-    reroute: bool
-    runs: tuple[FlowTrial, ...]
-
-    @property
-    def is_confirmed(self) -> bool:
-        """Whether any simulation showed that the flow is carried."""
-        return any(run.is_carried for run in self.runs)
-
-
-def find_flow(network: str, junction_blocker_s: float) -> FlowCapacity:
-    """Find how many random trips per hour a town carries.
-
-    Routes on empty streets give a first flow, at which the busiest junction has :data:`FIRST_LOAD` of
-    :data:`LANE_PER_H` on each lane that leads to it. Flows are raised by :data:`FLOW_FACTOR` as long as they are
-    carried, or lowered until one is, with vehicles that choose their routes at departure. If the first flow that is not
-    carried is carried with routes on empty streets, these are used from there on.
-
-    Parameters
-    ----------
-    network
-        The SUMO network, as text.
-    junction_blocker_s
-        As in ``[traffic]``.
-
-    Raises
-    ------
-    InputError
-        When no trip is possible.
-    """
-    with files.temporary_folder() as folder:
-        files.write_text(folder / sumo_folder.NETWORK_FILE, network)
-        trial = _TownTrial(folder, junction_blocker_s)
-        per_h, reroute = trial.first_flow(), True
-        trial.run_light_traffic(per_h)
-        carried: FlowTrial | None = None
-        too_much = math.inf
-        while len(trial.runs) < MAX_FLOW_RUNS:
-            run = trial.run(per_h, reroute)
-            if run.is_carried:
-                carried = run
-                per_h = round(per_h * FLOW_FACTOR)
-                if per_h > 0.99 * too_much:
-                    reroute = False
-            elif carried is None:
-                too_much = per_h
-                per_h = max(1, round(per_h / FLOW_FACTOR))
-            elif reroute:
-                reroute = False
-            else:
-                break
-        if carried is None:
-            return FlowCapacity(per_h, True, tuple(trial.runs))
-        return FlowCapacity(carried.vehicles_per_h, carried.reroute, tuple(trial.runs))
-
-
-class _TownTrial:
-    """Simulates flows through a town; the same trips depart at different rates."""
-
-    def __init__(self, folder: Path, junction_blocker_s: float) -> None:
-        self.runs: list[FlowTrial] = []
-        self._folder = folder
-        self._options = {
-            "ignore-junction-blocker": f"{junction_blocker_s:g}",
-            "step-length": f"{FLOW_STEP_S:g}",
-        }
-        self._traffic = TrafficConfig(network=sumo_folder.NETWORK_FILE)
-        self._roads = read_net_xml(folder / sumo_folder.NETWORK_FILE)
-        self._rng = np.random.default_rng(0)
-        files.write_text(folder / sumo_folder.VTYPES_FILE, demand.vtypes_xml(self._traffic.kinds))
-        self._ends = [
-            town_trips.trip_ends(self._roads, kind, self._traffic, _TRIAL_WHERE) for kind in self._traffic.kinds
-        ]
-        self._routed: list[demand.RoutedTrip] = []
-        self._n_trips = 0
-        self._share_in_light_traffic = 0.0
-
-    def first_flow(self) -> int:
-        """Return the flow, in vehicles per hour, at which the busiest junction has the load :data:`FIRST_LOAD`."""
-        self._draw(_LOAD_TRIPS)
-        incoming: dict[str, list[Edge]] = {}
-        for edge in self._roads.edges:
-            incoming.setdefault(edge.to_node, []).append(edge)
-        passes = Counter(edge for trip in self._routed for edge in trip.edges.split())
-        loads = []
-        for edges in incoming.values():
-            if len(edges) > 1:
-                loads.append(math.fsum(passes[edge.id] / (LANE_PER_H * len(edge.lanes)) for edge in edges))
-        per_trip = max(loads, default=0.0) / self._n_trips
-        if not per_trip:  # no junction
-            return LANE_PER_H
-        return max(1, round(FIRST_LOAD / per_trip))
-
-    def run_light_traffic(self, first_per_h: int) -> None:
-        """Measure which share of the vehicles stands in light traffic."""
-        per_h = max(_MIN_LIGHT_PER_H, round(LIGHT_SHARE * first_per_h))
-        self._share_in_light_traffic = self._simulate(per_h, True).standing.share_at_rest
-
-    def run(self, per_h: int, reroute: bool) -> FlowTrial:
-        """Simulate a flow."""
-        state = self._simulate(per_h, reroute)
-        share_queuing = round(max(0.0, state.standing.share_at_rest - self._share_in_light_traffic), 4)
-        run = FlowTrial(per_h, reroute, state.standing.longest_s, state.waiting, share_queuing)
-        self.runs.append(run)
-        return run
-
-    def _simulate(self, per_h: int, reroute: bool) -> _SimulationResult:
-        count = math.ceil(FLOW_DURATION_S * per_h / 3600.0)
-        if count > self._n_trips:
-            self._draw(count)
-        departs_s = np.arange(self._n_trips, dtype=np.float64) * (3600.0 / per_h)
-        departing = [trip for trip in self._routed if trip.number < count]
-        files.write_text(self._folder / sumo_folder.TRIPS_FILE, demand.routes_xml(departing, departs_s))
-        options = self._options | (demand.REROUTE_OPTIONS if reroute else {})
-        return _run_sumo(self._folder, FLOW_DURATION_S, FLOW_WARMUP_S, options)
-
-    def _draw(self, count: int) -> None:
-        """Draw and route trips, at least as many as a number."""
-        trips = town_trips.draw_town_trips(self._roads, self._traffic, self._ends, count, self._rng, _TRIAL_WHERE)
-        self._n_trips = count
-        self._routed = demand.route_trips(trips, self._folder, sumo_folder.NETWORK_FILE, sumo_folder.VTYPES_FILE)

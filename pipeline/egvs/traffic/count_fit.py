@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from egvs.core.errors import Diagnostic
@@ -32,14 +31,7 @@ class CountFit:
     geh: float
 
 
-class _EdgeExit(NamedTuple):
-    """Number of an edge on a route, and when the vehicle left it; -1 for never."""
-
-    number: int
-    time_s: float
-
-
-_NEVER = _EdgeExit(-1, -1.0)
+_NEVER = -1, -1.0
 
 
 def count_fits(traffic: TrafficConfig, routes: Path, first_s: float, end_s: float) -> list[CountFit]:
@@ -73,22 +65,21 @@ def count_fits(traffic: TrafficConfig, routes: Path, first_s: float, end_s: floa
     return fits
 
 
-def _edge_exits(vehicle: Element) -> dict[str, _EdgeExit]:
+def _edge_exits(vehicle: Element) -> dict[str, tuple[int, float]]:
+    """Return the number of each edge on the route, and when the vehicle left it; -1 for never."""
     route = next(vehicle.iter("route"))
     edges = route.get("edges", "").split()
     times = route.get("exitTimes", "").split()
-    return {
-        edge: _EdgeExit(number, float(time_s)) for number, (edge, time_s) in enumerate(zip(edges, times, strict=True))
-    }
+    return {edge: (number, float(time_s)) for number, (edge, time_s) in enumerate(zip(edges, times, strict=True))}
 
 
-def _passing_time_s(count: CountConfig, exits: Mapping[str, _EdgeExit]) -> float:
+def _passing_time_s(count: CountConfig, exits: Mapping[str, tuple[int, float]]) -> float:
     """Return when a vehicle leaves the counted edge, or the first one; -1 if it does not pass the location."""
     if count.edge:
-        return exits.get(count.edge, _NEVER).time_s
-    first = exits.get(count.from_edge or "", _NEVER)
-    last = exits.get(count.to_edge or "", _NEVER)
-    return first.time_s if 0 <= first.number < last.number else -1.0
+        return exits.get(count.edge, _NEVER)[1]
+    first, time_s = exits.get(count.from_edge or "", _NEVER)
+    last, _ = exits.get(count.to_edge or "", _NEVER)
+    return time_s if 0 <= first < last else -1.0
 
 
 def geh(counted_per_h: float, simulated_per_h: float) -> float:

@@ -122,7 +122,7 @@ class StreetNames:
         edge = self._by_lane.get(lane)
         if edge is None:
             return f"lane {lane}"
-        node = edge.to_node or _node_of_internal_edge(edge.id)
+        node = edge.to_node or edge.id[1:].rpartition("_")[0]  # ":J_3" is in the junction J
         return f"junction {shorten_id(node)}, {edge.name or f'edge {edge.id}'}"
 
     def end_of_lane(self, lane: str) -> XY | None:
@@ -144,10 +144,6 @@ def _line(points: FloatArray) -> shapely.Geometry:
     import shapely
 
     return shapely.LineString(points) if len(points) > 1 else shapely.Point(points[0])
-
-
-def _node_of_internal_edge(edge_id: str) -> str:
-    return edge_id[1:].rpartition("_")[0]
 
 
 def teleport_warning(

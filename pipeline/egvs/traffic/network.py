@@ -364,7 +364,7 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
     lane_links: list[tuple[str, str]] = []
     junctions: list[Junction] = []
     cycle_s = 0.0
-    signals: list[_Signal] = []
+    signals: list[tuple[tuple[str, int], tuple[str, int]]] = []
     reds_s: dict[tuple[str, int], float] = {}
     location = None
     roundabouts: list[Roundabout] = []
@@ -381,9 +381,8 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
                         connections.append(element.attrib)
                         if "tl" in element.attrib:
                             position = int(element.get("linkIndex", "-1"))
-                            signals.append(
-                                _Signal(start, int(element.attrib["fromLane"]), element.attrib["tl"], position)
-                            )
+                            lane = start, int(element.attrib["fromLane"])
+                            signals.append((lane, (element.attrib["tl"], position)))
                     if start.startswith(":") or end.startswith(":"):
                         lane_links.append((f"{start}_{element.get('fromLane')}", f"{end}_{element.get('toLane')}"))
                 case "junction":
@@ -440,25 +439,27 @@ def _longest_reds(phases: Sequence[_Phase]) -> dict[int, float]:
     return longest_s
 
 
-class _Signal(NamedTuple):
-    """The signal of a connection: the edge and the lane before it, its program, and its position in the states."""
-
-    edge: str
-    lane: int
-    program: str
-    position: int
-
-
 def _stop_lines(
-    signals: Sequence[_Signal], roads: Sequence[Edge], reds_s: Mapping[tuple[str, int], float]
+    signals: Sequence[tuple[tuple[str, int], tuple[str, int]]],
+    roads: Sequence[Edge],
+    reds_s: Mapping[tuple[str, int], float],
 ) -> Iterator[StopLine]:
-    """Yield the ends of the lanes at signals that become green."""
+    """Yield the ends of the lanes at signals that become green.
+
+    Parameters
+    ----------
+    signals
+        Edge and lane before each connection, and its program and position in the states.
+    roads
+        All roads.
+    reds_s
+        The longest red by program and position.
+    """
     by_id = {edge.id: edge for edge in roads}
     by_lane: dict[tuple[str, int], float] = {}
-    for signal in signals:
-        red_s = reds_s.get((signal.program, signal.position))
-        if red_s is not None and signal.edge in by_id:
-            lane = signal.edge, signal.lane
+    for lane, position in signals:
+        red_s = reds_s.get(position)
+        if red_s is not None and lane[0] in by_id:
             by_lane[lane] = max(red_s, by_lane.get(lane, 0.0))
     for (edge, index), red_s in by_lane.items():
         yield StopLine(_point(by_id[edge].lanes[index].text.split()[-1]), red_s)

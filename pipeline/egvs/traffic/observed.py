@@ -7,13 +7,13 @@ last 100 m before the stop line), of which one may be empty; and ``period`` in a
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from egvs.core.errors import InputError, find_misspelling
+from egvs.core.numbers import number_or_nan
 from egvs.formats import csv_tables
 from egvs.scenario.model import Scenario
 from egvs.traffic.approaches import ApproachIndex
@@ -106,10 +106,7 @@ def _parse_row(where: str, values: Mapping[str, str], index: ApproachIndex, peri
 def _parse_number(where: str, text: str, limit: float) -> float | None:
     if not text:
         return None
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = number_or_nan(text)
     if not 0 <= value <= limit:
         raise InputError(where, f"expected a number of 0 to {limit:,.0f}, got {text!r}", "Use a number such as 45.")
     return value

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -414,14 +414,6 @@ def _check_clock(connection: Any, timing: Timing, address: str) -> None:
         raise RunError(f"{where}: steps of {step_s:g} s from {now_ms / 1000:g} s on do not hit {first_frame}")
 
 
-class _FcdRow(NamedTuple):
-    """Id and type of a vehicle or person; x, y, z, angle, slope, speed."""
-
-    id: str
-    type: str
-    numbers: list[float]
-
-
 class _Subscriptions:
     """TraCI subscriptions to all vehicles, and to all persons if requested."""
 
@@ -453,14 +445,13 @@ class _Subscriptions:
         """Return the names of all vehicles on the road."""
         return [name for name, _ in self._results(self._connection.vehicle)]
 
-    def rows(self) -> list[_FcdRow]:
-        """Return the row of each vehicle and person, rounded as in SUMO's files."""
+    def rows(self) -> list[tuple[str, str, list[float]]]:
+        """Return each vehicle and person, rounded as in SUMO's files: id, type; x, y, z, angle, slope, speed."""
         rows = [self._row(name, values) for name, values in self._results(self._connection.vehicle)]
         if self._persons is not None:
             for name, values in self._results(self._connection.person):
-                row = self._row(name, values)
-                row.numbers[4] = 0.0  # no slope, as in fcd.read_fcd
-                rows.append(row)
+                rows.append(self._row(name, values))
+                rows[-1][2][4] = 0.0  # no slope, as in fcd.read_fcd
         return rows
 
     def _results(self, domain: Any) -> Iterator[tuple[str, Any]]:
@@ -469,12 +460,12 @@ class _Subscriptions:
             if values[self._position][0] != self._invalid:
                 yield name, values
 
-    def _row(self, name: str, values: Any) -> _FcdRow:
+    def _row(self, name: str, values: Any) -> tuple[str, str, list[float]]:
         vtype = values[self._type]
         if vtype not in self._sizes:
             self._sizes[vtype] = sumo.query_size(self._connection, vtype)
         numbers = (*values[self._position], values[self._angle], values[self._slope], values[self._speed])
-        return _FcdRow(name, vtype, [float(f"{number:.{sumo_folder.FCD_DIGITS}f}") for number in numbers])
+        return name, vtype, [float(f"{number:.{sumo_folder.FCD_DIGITS}f}") for number in numbers]
 
 
 def standing_limit_s(cycle_s: float) -> float:

@@ -26,6 +26,7 @@ from pydantic import ValidationError
 
 from egvs.core import files
 from egvs.core.errors import InputError
+from egvs.core.numbers import number_or_nan
 from egvs.core.wording import list_first, number_of, shorten_id
 from egvs.formats import csv_tables, xml
 from egvs.scenario.model import Scenario
@@ -372,10 +373,7 @@ def _check_header(path: Path, header: list[str]) -> list[str]:
 
 
 def _parse_seconds(text: str, where: str) -> float:
-    try:
-        number = float(text)
-    except ValueError:
-        number = float("nan")
+    number = number_or_nan(text)
     if not 0 <= number < 1e5:
         raise InputError(where, f"expected seconds, got {text!r}", "Use a number such as 30.")
     return number

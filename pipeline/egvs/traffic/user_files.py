@@ -14,7 +14,6 @@ routes may depend on them.
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import shutil
@@ -30,6 +29,7 @@ from xml.sax.saxutils import quoteattr
 from egvs.core import files
 from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
+from egvs.core.numbers import number_or_nan
 from egvs.formats import xml
 
 DEMAND_OPTIONS = ("route-files", "additional-files")
@@ -238,10 +238,7 @@ def _iter_options(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _parse_begin_s(value: str, path: Path) -> float:
-    try:
-        seconds = float(value)
-    except ValueError:
-        seconds = math.nan
+    seconds = number_or_nan(value)
     if not 0.0 <= seconds <= _MAX_BEGIN_S:
         problem = f"expected 0 to {_MAX_BEGIN_S:g} seconds"
         raise InputError(f"{path}: begin = {value[:80]!r}", problem, "Use 25200, for example, for seven o'clock.")

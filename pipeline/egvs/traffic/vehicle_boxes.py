@@ -296,11 +296,9 @@ class BoxChange(Protocol):
 
     def change(self, boxes: VehicleBoxes) -> VehicleBoxes:
         """Return the boxes of the next group, changed."""
-        ...
 
     def summary(self) -> dict[str, Any]:
         """Return what the stage reports about the changes, as JSON."""
-        ...
 
 
 class TrafficHook(Protocol):

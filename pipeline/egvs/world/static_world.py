@@ -152,12 +152,12 @@ def _add_mesh(builder: _Builder, path: Path, config: MeshConfig, world: Georefer
 
     triangles = np.asarray(mesh.faces, dtype=np.int64)
     vertices_m = _to_world(mesh.vertices, config, path, world)
-    pieces = meshes.divide_mesh(mesh)
-    for number, piece in pieces.closed.items():
+    closed, rest = meshes.divide_mesh(mesh)
+    for number, piece in closed.items():
         used, corners = np.unique(triangles[piece], return_inverse=True)
         builder.add(vertices_m[used], corners.reshape(-1, 3), f"{path.stem}_{number}", config.kind)
-    if len(pieces.open):
-        builder.add(vertices_m, triangles[pieces.open], f"{path.stem}_surface", config.kind, " (open surface)")
+    if len(rest):
+        builder.add(vertices_m, triangles[rest], f"{path.stem}_surface", config.kind, " (open surface)")
 
 
 def _to_world(vertices_m: Floats, config: MeshConfig, path: Path, world: Georeference) -> Floats:

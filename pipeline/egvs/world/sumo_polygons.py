@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
+from egvs.core.numbers import number_or_nan
 from egvs.core.wording import list_first
 from egvs.formats import xml
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference
@@ -350,10 +351,7 @@ def _parse_points(text: str, where: str) -> Points:
 
 def _check_height(text: str, where: str) -> None:
     """Raise an InputError unless an attribute ``height`` of a shape is a number above 0."""
-    try:
-        height_m = float(text)
-    except ValueError:
-        height_m = math.nan
+    height_m = number_or_nan(text)
     if not 0 < height_m < math.inf:
         raise InputError(f"{where}: height", f"expected a number of metres above 0, got {text!r}")
 

@@ -44,7 +44,6 @@ class GroundSource(Protocol):
         self, scenario: Scenario, low_m: NDArray[np.float64] | None = None, high_m: NDArray[np.float64] | None = None
     ) -> TerrainSurface:
         """Return the ground over a rectangle with the corners ``low_m`` and ``high_m``; by default, of the network."""
-        raise NotImplementedError
 
 
 Floats = NDArray[np.float64]

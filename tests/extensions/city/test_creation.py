@@ -21,12 +21,12 @@ from egvs.core.errors import InputError
 from egvs.creation import junctions
 from egvs.creation.junctions import StreetJunction
 from egvs.creation.openstreetmap import street_network
-from egvs.extensions.city import creation, model, traffic_split
+from egvs.extensions.city import creation, model, network_excerpts, traffic_split
 from egvs.extensions.city.creation import NewCityOptions
+from egvs.extensions.city.town_flow import FlowCapacity, FlowTrial
 from egvs.formats import osm
 from egvs.stages import traffic
 from egvs.traffic import network
-from egvs.traffic.capacity import FlowCapacity, FlowTrial
 from egvs.world import geolocation
 from tests.creation.new_scenarios import create_scenario
 from tests.stage_runner import run_stage
@@ -155,7 +155,7 @@ def test_network_excerpt_keeps_streets(extract: Path, tmp_path: Path) -> None:
     text, streets = street_network.build_network(
         read, extract, street_network.netconvert_flags(read, lefthand=False, walk=True)
     )
-    excerpts, complete = street_network.NetworkExcerpts(text), streets.network
+    excerpts, complete = network_excerpts.NetworkExcerpts(text), streets.network
     (tmp_path / "complete.net.xml").write_text(text)
     for junction in (junction for junction in streets.junctions if junction.arms >= 3):
         window = junctions.region_around(junction).area.buffer(80.0, join_style="mitre")

@@ -17,7 +17,6 @@ from egvs.extensions.city import city_run, costs, results, scheduler, tasks, tra
 from egvs.extensions.city.city_run import CityRunOptions
 from egvs.extensions.city.model import City
 from egvs.extensions.city.tasks import Job, JobResult, SceneResult
-from egvs.runs import stage_registry
 from egvs.world import static_world
 from tests.extensions.city.conftest import OVERRIDES, assert_same_run, run_separately
 from tests.extensions.city.real_cluster import wait_until
@@ -42,7 +41,7 @@ def before_recording(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]
 
 
 def test_scene_needs_no_stage_that_reads_traffic() -> None:
-    assert stage_registry.stages_without_traffic() == ("statics", "scan")
+    assert tasks.stages_without_traffic() == ("statics", "scan")
 
 
 @pytest.mark.slow

@@ -14,9 +14,10 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.creation.alignment import check_used
 from egvs.creation.map_parts import Alignment, MapContext
-from egvs.creation.terrain.ground_heights import CombinedTerrain, TinTerrain, ground_points, tin_terrain
+from egvs.creation.terrain.ground_heights import CombinedTerrain, TinTerrain, ground_points
 from egvs.extensions.maps.terrain import landxml as landxml_terrain
 from egvs.extensions.maps.terrain import rasters
+from egvs.extensions.maps.terrain.triangles import tin_terrain
 from egvs.formats.georeference import WorldFrame
 from tests.extensions.maps.formats.test_landxml import FACES, landxml
 from tests.extensions.maps.formats.test_rasters import EAST, NORTH, plane_cells, plane_m, write_ascii, write_tiff

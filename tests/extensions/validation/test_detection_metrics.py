@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.clouds.sweeps import Detections, detections_in_roi
+from egvs.clouds.sweeps import Detections
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.extensions.validation.detection_metrics import (
@@ -16,6 +16,7 @@ from egvs.extensions.validation.detection_metrics import (
     evaluate,
     frame_blocks,
 )
+from egvs.extensions.validation.detector_results import detections_in_roi
 from tests.oracles import kitti
 
 CAR = (0.75, 4.0, 2.0, 1.5, 0.0)  # z, length, width, height, yaw

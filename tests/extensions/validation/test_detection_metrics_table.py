@@ -7,9 +7,10 @@ import pytest
 
 from egvs.artefacts import parquet
 from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.clouds.sweeps import POINT_COUNTS_NAME, DetectedBoxes, Detections, PointCounts
+from egvs.clouds.sweeps import Detections
 from egvs.core.grid import Roi
 from egvs.extensions.validation import detection_metrics
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME, DetectedBoxes, PointCounts
 
 ROI = Roi((0.0, 0.0, 0.0), (50.0, 50.0, 5.0))
 CAR, BUS = (10.0, 10.0, 0.8, 4.5, 1.8, 1.6, 0.0), (30.0, 20.0, 1.5, 12.0, 2.5, 3.0, 1.0)

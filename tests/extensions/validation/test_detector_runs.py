@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from egvs import load
-from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core.errors import InputError, RunError
 from egvs.extensions.validation import held_out_traffic
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
 from tests.extensions.validation.stub_detectors import FailingDetector, MiddleDetector
 

@@ -8,9 +8,10 @@ import pytest
 
 from egvs import load
 from egvs.artefacts import parquet
-from egvs.clouds.sweeps import POINT_COUNTS_NAME, SiteView, Sweep
+from egvs.clouds.sweeps import SiteView, Sweep
 from egvs.extensions.validation import held_out_traffic
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.detector_runs import SiteDetectionTask
 from egvs.extensions.validation.detectors import base
 from egvs.extensions.validation.detectors.cluster import Cluster

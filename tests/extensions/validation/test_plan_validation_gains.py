@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 
-from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.extensions.validation.detection_metrics import (
     ALL_OBJECTS,
     BLOCKS,
@@ -13,6 +12,7 @@ from egvs.extensions.validation.detection_metrics import (
     SiteDetection,
     estimate_difference,
 )
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.plan_validation import SensorGroup, with_gains
 from egvs.sensors.sites import Pose, Site
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from egvs import load
-from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.extensions.validation.detection_metrics import (
     ALL_OBJECTS,
     BLOCKS,
@@ -16,6 +15,7 @@ from egvs.extensions.validation.detection_metrics import (
     JackknifeEstimate,
     SiteDetection,
 )
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.ranking_evidence import SiteRanking, check_ranking
 
 FRAMES = 10 * BLOCKS

@@ -10,7 +10,6 @@ import pytest
 from egvs import load
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_validation
-from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core.errors import InputError
 from egvs.extensions.validation.correlation import CorrelationStudy, JunctionScores, MeasureValues
 from egvs.extensions.validation.detection_metrics import (
@@ -20,6 +19,7 @@ from egvs.extensions.validation.detection_metrics import (
     JackknifeEstimate,
     SiteDetection,
 )
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.detectors import base
 from egvs.extensions.validation.held_out_traffic import FrameSampling
 from egvs.extensions.validation.kitti_results import KittiFiles

@@ -21,7 +21,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 import shapely
 from shapely.geometry import LineString, Point, Polygon
@@ -159,14 +158,6 @@ def way_area(way: Way, xy: dict[int, XY], counts: ImportCounts) -> BaseGeometry:
     return shapely.union_all(areas)
 
 
-class _Footprint(NamedTuple):
-    """The area of a building or a part of one."""
-
-    name: str
-    tags: Tags
-    area: BaseGeometry
-
-
 def find_buildings(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
     """Yield building outlines and parts; an outline is used only where it has no parts.
 
@@ -184,7 +175,7 @@ def find_buildings(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts)
             counts.drop("building", "no_outline")
 
     footprints = list(_footprints(extract, xy, counts))
-    part_areas = [footprint.area for footprint in footprints if not _is_outline(footprint.tags)]
+    part_areas = [area for _, tags, area in footprints if not _is_outline(tags)]
     parts_tree = shapely.STRtree(part_areas)
     for name, tags, area in footprints:
         parts: list[BaseGeometry] = []
@@ -235,8 +226,10 @@ def _building_type(tags: Tags) -> SolidType:
     return types[0]
 
 
-def _footprints(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[_Footprint]:
-    """Yield multipolygons, then closed ways that are not outer ways of multipolygons."""
+def _footprints(
+    extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts
+) -> Iterator[tuple[str, Tags, BaseGeometry]]:
+    """Yield name, tags and area of multipolygons, then of closed ways that are not outer ways of multipolygons."""
     outer_ways: set[int] = set()
     for relation in extract.relations:
         tags = _multipolygon_tags(relation, extract)
@@ -251,7 +244,7 @@ def _footprints(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) ->
         if outer is None or inner is None:
             counts.drop("building", "incomplete")
             continue
-        yield _Footprint(f"relation/{relation.id}", tags, outer.difference(inner))
+        yield f"relation/{relation.id}", tags, outer.difference(inner)
 
     for way in extract.ways.values():
         if way.id in outer_ways:
@@ -264,7 +257,7 @@ def _footprints(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) ->
         elif not way.closed or not _has_positions(way, xy):
             counts.drop("building", "incomplete")
         else:
-            yield _Footprint(f"way/{way.id}", way.tags, way_area(way, xy, counts))
+            yield f"way/{way.id}", way.tags, way_area(way, xy, counts)
 
 
 def _has_positions(way: Way, xy: dict[int, XY]) -> bool:

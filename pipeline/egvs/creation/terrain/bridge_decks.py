@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +31,6 @@ STEP_M = 5.0
 
 _LANE = re.compile(r"<lane\s[^>]*>")
 _WALKING_AREA = re.compile(r"^:.*_w\d+_\d+$")
-
-
-@dataclass(frozen=True)
-class _LaneSample:
-    """Points (n, 3) along a lane, and its width."""
-
-    id: str
-    points_m: FloatArray
-    width_m: float
 
 
 def bridge_decks(text: str, terrain: Terrain, zero_height_m: float) -> tuple[MappedMesh, ...]:
@@ -63,26 +53,28 @@ def bridge_decks(text: str, terrain: Terrain, zero_height_m: float) -> tuple[Map
     lanes = list(_lanes(text))
     if not lanes:
         return ()
-    points_m = np.concatenate([lane.points_m for lane in lanes])
+    points_m = np.concatenate([lane_m for _, lane_m, _ in lanes])
     above_m = points_m[:, 2] - (terrain.height_m(points_m[:, :2]) - zero_height_m)
+    above_by_lane_m = np.split(above_m, np.cumsum([len(lane_m) for _, lane_m, _ in lanes])[:-1])
     decks = []
-    for lane, heights_m in zip(lanes, _split(above_m, lanes), strict=True):
+    for (name, lane_m, width_m), heights_m in zip(lanes, above_by_lane_m, strict=True):
         with np.errstate(invalid="ignore"):
             is_high = heights_m > CLEARANCE_M
         for number, (first, last) in enumerate(_stretches(is_high)):
-            vertices_m, faces = _slab(lane.points_m[first : last + 1], lane.width_m / 2 + EDGE_M)
-            decks.append(MappedMesh(f"deck_{lane.id}_{number}", "bridge", vertices_m, faces, is_closed=True))
+            vertices_m, faces = _slab(lane_m[first : last + 1], width_m / 2 + EDGE_M)
+            decks.append(MappedMesh(f"deck_{name}_{number}", "bridge", vertices_m, faces, is_closed=True))
     return tuple(decks)
 
 
-def _lanes(text: str) -> Iterator[_LaneSample]:
+def _lanes(text: str) -> Iterator[tuple[str, FloatArray, float]]:
+    """Yield the id of each lane, points (n, 3) along it, and its width, metres."""
     for element in _LANE.findall(text):
         name = attribute(element, "id")
         shape_m = Shape(attribute(element, "shape"), f"lane {name}").shape_m
         is_line = len(shape_m) > 1 and np.hypot(*np.ptp(shape_m[:, :2], axis=0)) > 0
         if is_line and not _WALKING_AREA.match(name):
             width_m = float(attribute(element, "width") or LANE_WIDTH_M)
-            yield _LaneSample(name, sample_line(_distinct(shape_m), STEP_M)[0], width_m)
+            yield name, sample_line(_distinct(shape_m), STEP_M)[0], width_m
 
 
 def _distinct(points_m: FloatArray) -> FloatArray:
@@ -90,10 +82,6 @@ def _distinct(points_m: FloatArray) -> FloatArray:
     is_new = np.hypot(*np.diff(points_m[:, :2], axis=0).T) > 0
     distinct: FloatArray = points_m[np.concatenate([[True], is_new])]
     return distinct
-
-
-def _split(values: FloatArray, lanes: list[_LaneSample]) -> list[FloatArray]:
-    return np.split(values, np.cumsum([len(lane.points_m) for lane in lanes])[:-1])
 
 
 def _stretches(is_high: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

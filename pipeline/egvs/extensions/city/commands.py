@@ -207,14 +207,14 @@ def _run_options(
 
 
 def _print_traffic(folder: Path, result: CityTraffic) -> None:
-    from egvs.cli.console import console, print_mapping
+    from egvs.cli.console import console
     from egvs.core.errors import WARNINGS_KEY, collect_warnings
     from egvs.extensions.city import model
 
     out = console(_WIDTH)
-    print_mapping(_shown_statistics(result.summary), _WIDTH)
+    _print_mapping(_shown_statistics(result.summary), _WIDTH)
     for name, summary in result.summary.get("periods", {}).items():
-        print_mapping({name: _shown_statistics(summary)}, _WIDTH)
+        _print_mapping({name: _shown_statistics(summary)}, _WIDTH)
     if result.linked:
         junctions = ", ".join(result.linked)
         out.print(f"{model.JUNCTIONS_FOLDER}/*/scenario.toml: added the city's files and periods to {junctions}")
@@ -393,3 +393,16 @@ for verb in (new, traffic, run, place, compare):
     app.command()(verb)
 
 COMMANDS = (Command("city", "Decide", app),)
+
+
+def _print_mapping(values: Mapping[str, Any], file_width: int) -> None:
+    """Print one line per key; ``file_width`` is that of :func:`console`."""
+    from egvs.cli.console import console
+    from egvs.cli.value_text import format_value, format_values
+
+    out = console(file_width)
+    for key, value in values.items():
+        text = format_value(value)
+        if isinstance(value, dict):
+            text = format_values(value)
+        out.print(f"{key}: {text}")

@@ -6,8 +6,9 @@ junction set the region of interest, find pole locations along its kerbs, and se
 reach; write the folder that :mod:`egvs.extensions.city.model` describes.
 
 Traffic is drawn for the complete network, as much as a trial shows that it carries (:func:`find_flow` of
-:mod:`egvs.traffic.capacity`): flows assumed for each junction alone would count a vehicle several times that passes
-several junctions. It is simulated in steps of 0.5 s and without sublanes; with them, vehicles of a whole town lock.
+:mod:`egvs.extensions.city.town_flow`): flows assumed for each junction alone would count a vehicle several times that
+passes several junctions. It is simulated in steps of 0.5 s and without sublanes; with them, vehicles of a whole town
+lock.
 
 World frame: x (east), y (north) of the network in metres; the ground is z = 0. Tables have degrees (WGS 84). The same
 extract gives the same bytes.
@@ -38,16 +39,16 @@ from egvs.creation.openstreetmap import ATTRIBUTION
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
 from egvs.creation.openstreetmap.reader import check_inside_extract
-from egvs.creation.openstreetmap.street_network import NetworkExcerpts
 from egvs.creation.plain_network import NETWORK_FILE
 from egvs.creation.scenario_files import PITCHES_DEG, SITES_FILE, STATICS_FILE, TomlTable, reachable_area
 from egvs.extensions.city import model
 from egvs.extensions.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC_FOLDER, CityJunction
+from egvs.extensions.city.network_excerpts import NetworkExcerpts
+from egvs.extensions.city.town_flow import FlowCapacity, find_flow
 from egvs.formats.osm import read_osm as read_extract
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, TrafficConfig
-from egvs.traffic.capacity import FlowCapacity, find_flow
 
 SIGNALISED, ALL = "signalised", "all"
 REQUIRED_COLUMNS = ("junction", "lat_deg", "lon_deg")

@@ -18,7 +18,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
 import os
 import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -29,7 +28,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from egvs.core import limits, reading
 from egvs.core.errors import InputError
-from egvs.core.numbers import parse_decimal
+from egvs.core.numbers import number_or_nan, parse_decimal
 from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.fields import MAX_COORDINATE_M, NAME_DESCRIPTION, Name, StrictModel
 from egvs.scenario.loading import check_unused_keys, default_name, format_validation_error
@@ -242,10 +241,7 @@ def _parse_junction(where: str, row: dict[str, str]) -> CityJunction:
 def parse_number(where: str, row: dict[str, str], column: str) -> float:
     """Return a coordinate of a table of junctions; raise an InputError if it is no number or out of range."""
     limit = _MAX_COORDINATES[column]
-    try:
-        value = parse_decimal(row[column])
-    except ValueError:
-        value = math.nan
+    value = number_or_nan(row[column], parse_decimal)
     if not abs(value) <= limit:
         problem = f"expected a number from {-limit:g} to {limit:g}, got {repr(row[column])[:80]}"
         raise InputError(f"{where}: {column}", problem, "Correct the table.")

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.core import files, reading
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.resource_usage import ResourceUsage, measure_usage, release_memory
@@ -451,7 +451,7 @@ def prepare_scene(job: Job, settings: RunSettings) -> SceneResult:
             is_checked = _store_scene_report(context)
         if not is_checked:
             return SceneResult(job.junction, costs)
-        run.ensure_stages(context, *stage_registry.stages_without_traffic())
+        run.ensure_stages(context, *stages_without_traffic())
         scan_bytes = BYTES_PER_BEAM * sum(_beams_of_sites(context.scenario))
         if not context.scenario.scan.keep and scan_bytes <= settings.scan_bytes:
             with measure_usage() as costs[EARLY_SCANS]:
@@ -582,3 +582,14 @@ def _run_junction(job: Job, settings: RunSettings, options: StageOptions) -> Job
         record = run.run(job.scenario(), job.out, jobs=1, options=options, wait_s=_LOCK_WAIT_S, listener=listener)
         n_sites = record.stages["score"].summary["sites"]
         return JobResult(job.junction, n_sites, perf_counter() - start_s, tuple(stages_run))
+
+
+def stages_without_traffic() -> tuple[str, ...]:
+    """Return the stages that need neither recorded traffic nor an artefact of a stage that does, in order."""
+    names: list[str] = []
+    for name in STAGE_NAMES:
+        described = stage_registry.stage(name)
+        makers = {file.writer for file in described.reads}
+        if not described.reads_traffic and makers <= set(names):
+            names.append(name)
+    return tuple(names)

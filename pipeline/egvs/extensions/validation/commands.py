@@ -150,7 +150,7 @@ def train(
     from egvs.extensions.validation import tables as validation_tables
     from egvs.scenario.loading import load
 
-    model = options.model_file(out)
+    model = _model_file(out)
     plugins.require_libraries("training", "train", "torch", "onnx", "onnxscript", "onnxruntime")
     try:
         from egvs.extensions.validation.training import train
@@ -174,3 +174,10 @@ def train(
 
 
 COMMANDS = tuple(Command(verb.__name__, "Study", verb) for verb in (validate, scores, clouds, train))
+
+
+def _model_file(path: Path) -> Path:
+    """Return ``--out`` of ``egvs train``, whose name must end in .onnx."""
+    if path.suffix != ".onnx":
+        raise InputError("--out", f"expected a file that ends in .onnx, got {str(path)!r}", "Use --out model.onnx.")
+    return path

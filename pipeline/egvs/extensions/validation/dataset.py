@@ -26,7 +26,6 @@ from egvs._version import __version__
 from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
 from egvs.clouds import simulation as cloud_simulation
 from egvs.clouds.simulation import CloudSimulator
-from egvs.clouds.sweeps import CLASSES
 from egvs.core import files
 from egvs.core.errors import InputError, RunError, unknown_site
 from egvs.core.progress import ProgressCallback, no_progress
@@ -42,6 +41,7 @@ from egvs.extensions.validation.dataset_files import (
     SiteSummary,
     write_site,
 )
+from egvs.extensions.validation.detector_results import CLASSES
 from egvs.extensions.validation.held_out_traffic import HeldOutTraffic
 from egvs.runs import locks
 from egvs.scenario.model import Scenario

@@ -28,14 +28,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.clouds import sweeps
 from egvs.clouds.simulation import CloudSimulator, sweep_rng
 from egvs.clouds.sweeps import BoolArray
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.progress import ProgressCallback
 from egvs.core.threads import map_ordered
-from egvs.extensions.validation import kitti
+from egvs.extensions.validation import detector_results, kitti
 from egvs.extensions.validation.held_out_traffic import HeldOutTraffic
 from egvs.extensions.validation.kitti import wrap_angle
 from egvs.formats import pcd, ply
@@ -424,7 +423,7 @@ def _write_frame(
     level = LevelFrame(view.pose)
     cloud = simulator.sweep(frame, sweep_rng(record.scenario.seed, view.site, frame.number))
     boxes = level.boxes(frame.boxes)
-    classes = sweeps.frame_classes(frame)
+    classes = detector_results.frame_classes(frame)
     points_on_box = cloud.points_on(len(boxes))
     labelled = np.flatnonzero(points_on_box)
     name = frame_name(frame.number)

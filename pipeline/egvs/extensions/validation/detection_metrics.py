@@ -62,18 +62,17 @@ import numpy as np
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.traffic_frames import BOX_COLUMNS, TrafficFrame
-from egvs.clouds.sweeps import (
+from egvs.clouds.sweeps import BoolArray, Detections
+from egvs.core.errors import Diagnostic, InputError
+from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.extensions.validation.detector_results import (
     CAR_VCLASSES,
     POINT_COUNTS_NAME,
-    BoolArray,
     DetectedBoxes,
-    Detections,
     DetectorResult,
     PointCounts,
     concatenate_boxes,
 )
-from egvs.core.errors import Diagnostic, InputError
-from egvs.core.grid import FloatArray, IntArray, Roi
 from egvs.kernels import detection
 
 BLOCKS = 10

@@ -24,9 +24,8 @@ import numpy as np
 
 from egvs.artefacts import parquet
 from egvs.clouds import simulation as cloud_simulation
-from egvs.clouds import sweeps
 from egvs.clouds.simulation import CloudSimulator, sweep_rng
-from egvs.clouds.sweeps import POINT_COUNTS_NAME, DetectedBoxes, Detections, DetectorResult, PointCounts, Sweep
+from egvs.clouds.sweeps import Detections, Sweep
 from egvs.core import files
 from egvs.core.errors import RunError
 from egvs.core.progress import ProgressCallback, no_progress
@@ -34,6 +33,8 @@ from egvs.core.resource_usage import ResourceUsage, measure_usage
 from egvs.core.threads import thread_count
 from egvs.effects import registry
 from egvs.effects.base import Effect
+from egvs.extensions.validation import detector_results
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME, DetectedBoxes, DetectorResult, PointCounts
 from egvs.extensions.validation.detectors.base import Detector
 from egvs.extensions.validation.held_out_traffic import HeldOutTraffic
 from egvs.runs import stage_keys, stage_registry
@@ -150,7 +151,7 @@ class DetectionTaskBase(Generic[DetectorT]):
                 points_on_box.append(labelled.points_on(len(frame.boxes)))
             points.append(np.array(points_on_box)[:, frame.target_rows(roi)].sum(axis=0))
             for name, detect in detectors.items():
-                detections[name].append(sweeps.detections_in_roi(detect(frame_sweeps), roi))
+                detections[name].append(detector_results.detections_in_roi(detect(frame_sweeps), roi))
 
         results: dict[str, DetectorResult] = {name: DetectedBoxes(tuple(boxes)) for name, boxes in detections.items()}
         if with_points:

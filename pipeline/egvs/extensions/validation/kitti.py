@@ -25,7 +25,7 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.core.numbers import parse_decimal
+from egvs.core.numbers import number_or_nan, parse_decimal
 
 _NOT_TRUNCATED_NOT_OCCLUDED = "0.00 0"
 _RECTANGLE = "0.00 0.00 50.00 50.00"
@@ -165,10 +165,7 @@ def _parse_values(where: str, words: list[str]) -> list[float]:
         raise InputError(where, problem, _LABELS_HINT)
     values = []
     for word in words[1:]:
-        try:
-            value = parse_decimal(word)
-        except ValueError:
-            value = math.nan
+        value = number_or_nan(word, parse_decimal)
         if not math.isfinite(value):
             raise InputError(where, f"expected a finite number, got {word!r}", _LABELS_HINT)
         values.append(value)

@@ -28,13 +28,13 @@ from pathlib import Path
 import numpy as np
 
 from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.clouds import sweeps
-from egvs.clouds.sweeps import CLASSES, DetectedBoxes, Detections, DetectorResult
+from egvs.clouds.sweeps import Detections
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import IntArray
-from egvs.extensions.validation import kitti
+from egvs.extensions.validation import detector_results, kitti
 from egvs.extensions.validation.dataset_files import LAYOUTS, LevelFrame, frame_name
+from egvs.extensions.validation.detector_results import CLASSES, DetectedBoxes, DetectorResult
 from egvs.extensions.validation.held_out_traffic import HeldOutTraffic
 from egvs.sensors.sites import Pose
 
@@ -209,7 +209,7 @@ def _write_truth(folder: Path, record: HeldOutTraffic, frames: Sequence[TrafficF
         (folder / name).mkdir(parents=True)
     for frame in frames:
         rows = frame.target_rows(record.scene.roi)
-        classes = sweeps.frame_classes(frame)
+        classes = detector_results.frame_classes(frame)
         text = kitti.format_labels([classes[row] for row in rows], level.boxes(frame.boxes[rows]))
         files.write_text(folder / "label_2" / f"{frame_name(frame.number)}.txt", text)
         files.write_text(folder / "calib" / f"{frame_name(frame.number)}.txt", kitti.CALIBRATION)

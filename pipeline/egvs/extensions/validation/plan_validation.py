@@ -31,12 +31,12 @@ import numpy as np
 from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.clouds import simulation as cloud_simulation
-from egvs.clouds.sweeps import POINT_COUNTS_NAME, DetectorResult
 from egvs.core import files
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.extensions.validation import detection_metrics
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS, UNDEFINED, JackknifeEstimate, SiteDetection
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME, DetectorResult
 from egvs.extensions.validation.detector_runs import (
     DetectionListener,
     DetectionTaskBase,

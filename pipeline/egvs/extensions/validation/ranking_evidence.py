@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from egvs.artefacts.readers import read_scores
-from egvs.clouds.sweeps import POINT_COUNTS_NAME, BoolArray
+from egvs.clouds.sweeps import BoolArray
 from egvs.extensions.validation import detection_metrics, ranking_check
 from egvs.extensions.validation.correlation import MIN_POLES, CorrelationStudy, JunctionScores, MeasureValues
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS, BLOCKS, SiteDetection
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.ranking_check import DetectorCheck, RankCorrelation, RankingCheck, none_if_nan
 from egvs.extensions.validation.results import MEASURE_NOUNS, main_measure
 from egvs.runs import run as runs

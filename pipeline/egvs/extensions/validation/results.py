@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from egvs.artefacts.run_folder import RunFolder
-from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core import files
 from egvs.core.errors import Diagnostic
 from egvs.extensions.validation.correlation import Correlation
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS, SiteDetection
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.held_out_traffic import TrafficSample
 from egvs.extensions.validation.ranking_check import DetectorCheck, RankingCheck
 from egvs.extensions.validation.surrogates import Surrogates

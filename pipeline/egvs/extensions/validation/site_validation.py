@@ -20,7 +20,6 @@ import numpy as np
 
 from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.clouds.sweeps import POINT_COUNTS_NAME, DetectedBoxes, detections_in_roi
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
@@ -28,6 +27,7 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.extensions.validation import detection_metrics, kitti_results, ranking_evidence, results, surrogates
 from egvs.extensions.validation.correlation import CorrelationStudy, JunctionScores, MeasureValues
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS, SiteDetection
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME, DetectedBoxes, detections_in_roi
 from egvs.extensions.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
 from egvs.extensions.validation.detectors import base
 from egvs.extensions.validation.held_out_traffic import FrameSampling, HeldOutTraffic

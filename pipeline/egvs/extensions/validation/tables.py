@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from egvs.cli.console import NARROW, Column, console, print_sentences, print_table
-from egvs.clouds.sweeps import POINT_COUNTS_NAME
-from egvs.core.remaining_time import RemainingTime
 from egvs.core.wording import format_percent, number_of
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.detector_runs import DetectionListener
+from egvs.extensions.validation.remaining_time import RemainingTime
 from egvs.extensions.validation.results import main_measure
 from egvs.results.labels import SCORE_LABELS
 from egvs.scenario.score_config import DEFAULT_SCORE

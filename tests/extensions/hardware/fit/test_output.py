@@ -99,7 +99,7 @@ def four_sweeps() -> SensorFit:
 def test_empty_scan_is_upright(tmp_path: Path, four_sweeps: SensorFit) -> None:
     written = output.write_fit(four_sweeps, "four", tmp_path)
     assert {"empty_scan.png", "empty_scan.pcd", "returns.ply"} <= set(written.names)
-    points = point_clouds.read_points(tmp_path / "empty_scan.pcd", "scan").points_m
+    points, _ = point_clouds.read_points(tmp_path / "empty_scan.pcd", "scan")
     lowest = points[points[:, 2] < 0.5]
     assert len(lowest) > 500
     assert np.median(lowest[:, 2]) == pytest.approx(0.0, abs=0.02)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from egvs import load
-from egvs.clouds.sweeps import POINT_COUNTS_NAME as POINTS_ON
-from egvs.clouds.sweeps import DetectedBoxes, PointCounts
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
+from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME as POINTS_ON
+from egvs.extensions.validation.detector_results import DetectedBoxes, PointCounts
 from egvs.extensions.validation.detector_runs import SiteDetectionTask
 from egvs.extensions.validation.detectors import pointpillars
 from egvs.extensions.validation.detectors.pointpillars import POINTS_PER_PILLAR, PillarPoints, PillarWindow

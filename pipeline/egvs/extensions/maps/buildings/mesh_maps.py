@@ -71,10 +71,10 @@ def _pieces(
 ) -> Iterator[MappedMesh]:
     """Yield the closed pieces of a mesh in the window, then the rest."""
     faces = np.asarray(mesh.faces, dtype=np.int64)
-    pieces = meshes.divide_mesh(mesh)
-    parts = [(f"{stem}_{number}", triangles, True) for number, triangles in pieces.closed.items()]
-    if len(pieces.open):
-        parts.append((f"{stem}_surface", pieces.open, False))
+    closed_pieces, rest = meshes.divide_mesh(mesh)
+    parts = [(f"{stem}_{number}", triangles, True) for number, triangles in closed_pieces.items()]
+    if len(rest):
+        parts.append((f"{stem}_surface", rest, False))
     for name, triangles, closed in parts:
         used, corners = np.unique(faces[triangles], return_inverse=True)
         low, high = vertices_m[used, :2].min(axis=0), vertices_m[used, :2].max(axis=0)

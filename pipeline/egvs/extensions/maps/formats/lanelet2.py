@@ -21,6 +21,7 @@ from xml.etree.ElementTree import Element
 
 from egvs.core import limits
 from egvs.core.errors import InputError
+from egvs.core.numbers import number_or_nan
 from egvs.formats import xml
 from egvs.formats.osm import Member, Tags, Way
 
@@ -162,10 +163,7 @@ def read_lanelet2(path: Path) -> LaneletMap:
 
 def parse_number(where: str, text: str | None, limit: float = math.inf, unit: str = "a number") -> float:
     """Parse a number of a map; InputError unless it is finite and within ``[-limit, limit]``."""
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
+    value = number_or_nan(text or "")
     if not math.isfinite(value) or abs(value) > limit:
         expected = unit if math.isinf(limit) else f"{unit} from {-limit:g} to {limit:g}"
         raise InputError(where, f"expected {expected}, got {text!r}", _VALUE_HINT)

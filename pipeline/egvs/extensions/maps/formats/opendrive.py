@@ -30,6 +30,7 @@ import numpy as np
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.numbers import number_or_nan
 from egvs.formats import xml
 
 ROOT = "OpenDRIVE"
@@ -536,10 +537,7 @@ def _number(element: Element, key: str, default: float | None = None) -> float:
         if default is None:
             raise KeyError(key)
         return default
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = number_or_nan(text)
     if not math.isfinite(value):
         raise ValueError(f"<{element.tag}>: {key}: expected a number, got {text[:40]!r}")
     return value

@@ -20,13 +20,14 @@ from egvs.core import files, polylines
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import number_of
-from egvs.creation.plain_network import NETWORK_FILE, PlainElement, PlainNetwork, format_number, format_shape
+from egvs.creation.plain_network import NETWORK_FILE
 from egvs.extensions.maps.formats.lanelet2 import LaneletMap
 from egvs.extensions.maps.lane_changes import NO_CHANGE
 from egvs.extensions.maps.lanelet2 import rules
 from egvs.extensions.maps.lanelet2.crosswalks import Crosswalk
 from egvs.extensions.maps.lanelet2.lane_changes import find_lane_changes
 from egvs.extensions.maps.lanelet2.nodes import ATTEMPTS, NodeShapes, lane_errors_m
+from egvs.extensions.maps.lanelet2.plain_network import PlainElement, PlainNetwork, format_number, format_shape
 from egvs.extensions.maps.lanelet2.right_of_way import find_right_of_way
 from egvs.extensions.maps.lanelet2.road_layout import Road, RoadLayout, Turn
 from egvs.extensions.maps.lanelet2.sidewalks import crossing_elements, crossing_lines_m, sidewalk_element

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 from shapely.geometry import LineString
 
-from egvs.creation.plain_network import PlainElement
 from egvs.extensions.maps.formats.lanelet2 import LaneletMap
+from egvs.extensions.maps.lanelet2.plain_network import PlainElement
 from egvs.extensions.maps.lanelet2.road_layout import RoadLayout, Turn
 
 RoadPair = tuple[str, str]

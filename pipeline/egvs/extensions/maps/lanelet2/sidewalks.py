@@ -14,8 +14,9 @@ import numpy as np
 
 from egvs.core import files
 from egvs.core.grid import FloatArray
-from egvs.creation.plain_network import NETWORK_FILE, PlainElement, format_number, format_shape
+from egvs.creation.plain_network import NETWORK_FILE
 from egvs.extensions.maps.lanelet2.crosswalks import Crosswalk
+from egvs.extensions.maps.lanelet2.plain_network import PlainElement, format_number, format_shape
 from egvs.extensions.maps.lanelet2.road_layout import Road
 from egvs.extensions.maps.lanelet2.signals import SignalPlan
 from egvs.formats import xml

@@ -19,8 +19,8 @@ import numpy as np
 from shapely.geometry import LineString, Point
 
 from egvs.core.grid import FloatArray
-from egvs.creation.plain_network import PlainElement
 from egvs.extensions.maps.formats.lanelet2 import LaneletMap, Regulation
+from egvs.extensions.maps.lanelet2.plain_network import PlainElement
 from egvs.extensions.maps.lanelet2.road_layout import RoadLayout, Turn
 
 STOP_LINE_RANGE_M = 10.0

@@ -13,10 +13,11 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.creation.map_parts import MapContext
-from egvs.creation.terrain.ground_heights import CombinedTerrain, TinTerrain, combine_tins, tin_terrain
+from egvs.creation.terrain.ground_heights import CombinedTerrain, TinTerrain
 from egvs.extensions.maps.buildings import citygml
 from egvs.extensions.maps.formats.citygml import read_relief
 from egvs.extensions.maps.formats.mesh_codes import parse_tile_name
+from egvs.extensions.maps.terrain.triangles import combine_tins, tin_terrain
 
 _STEPS = 5
 """Points on each side of the window whose coordinates give its bounds in another system."""

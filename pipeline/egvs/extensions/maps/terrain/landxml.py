@@ -7,8 +7,9 @@ from pathlib import Path
 
 from egvs.core.wording import by_number, number_of
 from egvs.creation.map_parts import MapContext
-from egvs.creation.terrain.ground_heights import CombinedTerrain, combine_tins, tin_terrain
+from egvs.creation.terrain.ground_heights import CombinedTerrain
 from egvs.extensions.maps.formats import landxml
+from egvs.extensions.maps.terrain.triangles import combine_tins, tin_terrain
 
 
 def read_terrain(paths: Sequence[Path], context: MapContext) -> CombinedTerrain:

@@ -17,9 +17,10 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import by_number, format_percent, number_of
 from egvs.creation.map_parts import MapContext
-from egvs.creation.terrain.ground_heights import check_heights, window_points
+from egvs.creation.terrain.ground_heights import window_points
 from egvs.extensions.maps.formats import rasters
 from egvs.extensions.maps.formats.rasters import HeightGrid
+from egvs.extensions.maps.terrain.triangles import check_heights
 from egvs.formats import xml
 
 _RIM_POINTS = 21

@@ -19,11 +19,12 @@ import torch
 
 from egvs._version import __version__
 from egvs.clouds.simulation import CloudSimulator
-from egvs.clouds.sweeps import Detections, detections_in_roi
+from egvs.clouds.sweeps import Detections
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.extensions.validation.detection_metrics import EvaluationFrames, GroundTruth, evaluate
+from egvs.extensions.validation.detector_results import detections_in_roi
 from egvs.extensions.validation.detectors.pointpillars import Convention, PointPillars
 from egvs.extensions.validation.held_out_traffic import MIN_SPACING_S, HeldOutTraffic, prepare_held_out_traffic
 from egvs.extensions.validation.training import pillar_net

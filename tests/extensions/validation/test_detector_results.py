@@ -6,22 +6,25 @@ import numpy as np
 import pytest
 
 from egvs.clouds import simulation as cloud_simulation
-from egvs.clouds import sweeps
-from egvs.clouds.sweeps import CAR_VCLASSES, DetectedBoxes, Detections, PointCounts
+from egvs.clouds.sweeps import Detections
 from egvs.core.errors import InputError
+from egvs.extensions.validation import detector_results
+from egvs.extensions.validation.detector_results import CAR_VCLASSES, DetectedBoxes, PointCounts
 
 
 def test_every_vclass_with_body_has_class():
     known = tomllib.loads(cloud_simulation.BODIES_FILE.read_text())["classes"]
-    assert {name for name in known if sweeps.object_class(name) == "Misc"} == set()
-    assert {name for name in known if sweeps.object_class(name) == "Car"} == CAR_VCLASSES
-    assert {sweeps.object_class(name) for name in known} | {"Trailer", "Misc"} == set(sweeps.CLASSES)
+    assert {name for name in known if detector_results.object_class(name) == "Misc"} == set()
+    assert {name for name in known if detector_results.object_class(name) == "Car"} == CAR_VCLASSES
+    assert {detector_results.object_class(name) for name in known} | {"Trailer", "Misc"} == set(
+        detector_results.CLASSES
+    )
 
 
 def test_rear_parts_are_trailers_except_of_buses():
-    assert [sweeps.object_class("truck", part) for part in (0, 1)] == ["Truck", "Trailer"]
-    assert [sweeps.object_class("bus", part) for part in (0, 1)] == ["Bus", "Bus"]
-    assert sweeps.object_class("ship") == "Misc"
+    assert [detector_results.object_class("truck", part) for part in (0, 1)] == ["Truck", "Trailer"]
+    assert [detector_results.object_class("bus", part) for part in (0, 1)] == ["Bus", "Bus"]
+    assert detector_results.object_class("ship") == "Misc"
 
 
 def _same(detections, again):

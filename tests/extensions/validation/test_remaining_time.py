@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from egvs.core.remaining_time import RemainingTime
+from egvs.extensions.validation.remaining_time import RemainingTime
 
 
 def estimates(seconds: list[float], workers: int) -> list[tuple[float, float]]:
