@@ -26,10 +26,10 @@ import egvs
 from benchmarks import page_tables
 from benchmarks.page_tables import Cells
 from egvs.artefacts import parquet
-from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
+from egvs.extensions.validation.files import DETECTION
 from egvs.extensions.validation.held_out_traffic import FrameSampling
 from egvs.extensions.validation.site_validation import validate_sites
 from egvs.results.labels import SCORE_LABELS
@@ -264,7 +264,7 @@ def measure_ap(path: Path, folder: Path, frames: int) -> DetectorResults:
     """Return what a detector finds from each mount; the scenario is validated unless the folder has that already."""
     scenario = egvs.load(path, [f"score.rank_by={DEFAULT_SCORE}"])
     out = folder / scenario.name
-    detection = RunFolder(out).detection
+    detection = out / DETECTION.name
     if not detection.is_file():
         validate_sites(scenario, out, sampling=FrameSampling(frames, None), detectors=(DETECTOR,))
     rows = parquet.read_artefact(detection, "detection")[0].to_pylist()

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import ast
 import re
+import shutil
 from pathlib import Path
 
 import pytest
 from importlinter.cli import lint_imports
 
 import egvs
+from egvs.artefacts.run_folder import extension_files
+from egvs.core import plugins
 from tests import platform_tests, public_names
 from tests.public_names import run_folder, run_python  # noqa: F401 - a fixture
 
@@ -66,6 +69,49 @@ def test_parquet_and_schemas_are_read_in_one_place() -> None:
         if isinstance(node, ast.Constant) and node.value == "data_schemas"
     }
     assert named == {"core/package_data.py"}
+
+
+DECLARATIONS = {"commands", "files", "folder_kind", "readers", "report_section", "source"}
+"""Light modules of extensions, which entry points name."""
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_run_imports_only_declarations_of_extensions(tmp_path: Path) -> None:
+    """The second run also looks for files of a user in its folder."""
+    code = """
+import sys
+from egvs.cli.app import app
+for _ in range(2):
+    try:
+        app(["run", "demo", "--out", "out", "--set", "traffic.frames=50"])
+    except SystemExit as end:
+        assert not end.code
+print([name for name in sys.modules if name.startswith("egvs.extensions.")])
+"""
+    shutil.copytree(egvs.shipped_scenario("demo"), tmp_path / "demo")
+    imported = set(ast.literal_eval(run_python(code, tmp_path).splitlines()[-1]))
+    modules = {name for name in imported if name.count(".") > 2}
+    assert {name for name in modules if name.rpartition(".")[2] not in DECLARATIONS} == set()
+    used = {
+        plugins.plugin_module(group, name)
+        for group in ("egvs.files", "egvs.report_sections")
+        for name in plugins.plugin_names(group)
+    }
+    assert used <= imported
+
+
+def test_the_core_names_no_file_of_an_extension() -> None:
+    sources = [path for suffix in ("py", "j2", "js", "toml") for path in PACKAGE.rglob(f"*.{suffix}")]
+    core = {path: path.read_text(encoding="utf-8") for path in sources if "extensions" not in path.parts}
+    assert "what_if.json" in core[PACKAGE / "artefacts" / "run_folder.py"]
+    named = [
+        f"{path.relative_to(PACKAGE)}: {file.name}"
+        for path, text in core.items()
+        for file in extension_files()
+        if file.name in text
+    ]
+    assert named == []
 
 
 @pytest.mark.system

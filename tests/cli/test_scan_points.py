@@ -13,6 +13,7 @@ from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
 from egvs.formats.point_clouds import read_points
+from egvs.results.command_entries import DIGEST_KEY, what_if_digest
 from egvs.runs.command_results import add_to_report
 from egvs.stages import scan
 
@@ -102,10 +103,10 @@ def test_the_run_stays_complete_and_its_report_shows_later_results(mini: Path, r
     assert after.stages["scan"].cost == before.stages["scan"].cost
 
     after.having("report", None).write(run)  # as an older version left it
-    row = egvs.read_scores(run / "scores.parquet").to_pylist()[0]
-    pose = {name: row[name] for name in ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")}
-    entry = {"sensor": "s", "passed": False, "reasons": ["too low"], "path": "", "pose": pose}
-    written = add_to_report(run, RunFolder.acceptance, {row["site"]: entry})
+    names = dict.fromkeys(("best_before", "best_present", "best_expected"), "pole_a")
+    answer = {**names, "share": None, "change": None, "conclusion": "pole_a stays", "tables": []}
+    answer[DIGEST_KEY] = what_if_digest(egvs.load(mini), [])
+    written = add_to_report(run, RunFolder.what_if, {"together": answer})
     assert run / "report.html" in written
-    assert b"too low" in (run / "report.html").read_bytes() and b"too low" not in report
+    assert b"pole_a stays" in (run / "report.html").read_bytes() and b"pole_a stays" not in report
     assert list(RunRecord.read(run).stages) == list(STAGE_NAMES)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import csv
+import html
 import json
 import re
 import zlib
@@ -146,6 +147,14 @@ def make_record(seconds=1.25):
 def render_report(scenario, out):
     run_stage(page, scenario, out)
     return (out / "report.html").read_text(encoding="utf-8")
+
+
+def section_text(text, name):
+    """The text of a section without tags, white space as single spaces; None if the page has none."""
+    match = re.search(rf'<section id="{name}">(.*?)</section>', text, re.DOTALL)
+    if match is None:
+        return None
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", match[1])).split())
 
 
 class PageReader(HTMLParser):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import MissingBackendError
 from egvs.report import extension_sections, page
 from tests.core.test_plugins import clear_caches, install
@@ -24,9 +26,9 @@ class Notes:
     files = ("notes.txt",)
     template = Path(__file__).with_name("notes.html.j2")
 
-    def read(self, folder, stages):
+    def read(self, folder, scenario, stages):
         path = folder / "notes.txt"
-        return path.read_text().split() if path.is_file() else None
+        return [scenario.name, *path.read_text().split()] if path.is_file() else None
 
     def warnings(self, values):
         if "stop" in values:
@@ -61,7 +63,7 @@ def test_page_shows_the_section_and_its_warning(site: Path, tmp_path: Path) -> N
     assert "notes" not in PageReader(render_report(scenario, out)).ids
     (out / "notes.txt").write_text("go <b>")
     text = render_report(scenario, out)
-    assert "<p>go</p><p>&lt;b&gt;</p></section>" in text and "a note says" not in text
+    assert "<p>trial</p><p>go</p><p>&lt;b&gt;</p></section>" in text and "a note says" not in text
     (out / "notes.txt").write_text("stop")
     text = render_report(scenario, out)
     assert ", but a note says stop</h1>" in text
@@ -79,7 +81,23 @@ def test_files_template_and_module_are_inputs_of_the_report(site: Path, tmp_path
     assert "plug_notes" in extension_sections.section_modules()
 
 
-def test_rejects_object_that_is_no_section(site: Path) -> None:
+def test_scenario_and_stages_are_inputs_of_the_report_where_a_section_has_a_file(site: Path, tmp_path: Path) -> None:
+    box = {"x_m": 2.0, "y_m": 2.0, "length_m": 1.0, "width_m": 1.0, "height_m": 1.0}
+    scenario, out = run_to_scores(tmp_path / "run", what_if={"lorry": {"share": 0.25, "boxes": [box]}})
+    other = scenario.model_copy(update={"what_if": {}})
+    assert inputs_of(page, other, out) == inputs_of(page, scenario, out)
+    (out / "notes.txt").write_text("go")
+    before = inputs_of(page, scenario, out)
+    assert inputs_of(page, other, out) != before
+    record = RunRecord.read(out)
+    record.having("tpog", replace(record.stages["tpog"], inputs="others")).write(out)
+    assert inputs_of(page, scenario, out) != before
+
+
+def test_rejects_object_that_is_no_section(site: Path, tmp_path: Path) -> None:
+    scenario, out = run_to_scores(tmp_path / "run")
     (site / "plug_notes.py").write_text("SECTION = 7")
+    forget_sections()
+    sys.modules.pop("plug_notes", None)
     with pytest.raises(MissingBackendError, match="expected an object with name, files, template, read and warnings"):
-        extension_sections.read_sections(RunFolder(site), {})
+        extension_sections.read_sections(RunFolder(out), scenario, {})

@@ -338,7 +338,7 @@ def test_accuracy_and_validation_of_a_run_are_written_into_it(here: Path, run_eg
     assert "egvs run mini --set score.gamma=5.0" in printed
     code, _, messages = run_egvs("validate", OTHER, "--frames", 10, "--detector", "points")
     assert code == 0, messages
-    assert RunFolder(OTHER).detection.is_file()
+    assert (OTHER / "detection.parquet").is_file()
     assert [path.name for path in Path("runs").iterdir()] == [OTHER.name]
 
 

@@ -1,4 +1,4 @@
-"""Results of commands that work on a finished run, as JSON files in its folder: what-ifs, sheets, acceptance, design.
+"""Results of commands that work on a finished run, as JSON files in its folder: what-ifs, installation sheets.
 
 A file has one entry by name, for example for each site. With each entry it records the inputs of the stages that the
 result depends on, so that the report shows an entry only while it belongs to the run.

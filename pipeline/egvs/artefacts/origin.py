@@ -60,7 +60,8 @@ def _recorded_names(folder: RunFolder) -> set[str]:
     if folder.has_record:
         for stage in RunRecord.read(folder.path).stages.values():
             names |= stage.artefacts.keys()
-    for path in (folder.accuracy_checksums, folder.validation_checksums, folder.placement_checksums):
+    for file in RunFolder.checksum_files():
+        path = folder / file.name
         if path.is_file():
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
             names.update(match[1] for match in map(_CHECKSUM_LINE.fullmatch, lines) if match)

@@ -3,8 +3,9 @@
 Columns, types and units are declared once, in ``data_schemas/<artefact>.schema.json`` (Frictionless Table Schema with
 ``unit`` and ``arrow_type`` beside each field); no other module reads that folder.
 
-Metadata is one JSON object under the Parquet key ``egvs``. Nothing in a file depends on the clock, the machine, the
-number of threads or the path.
+Metadata is one JSON object under the Parquet key ``egvs``. The schema declares the keys that readers need as well:
+``metadata`` maps each to its kind, one of those in :func:`_is_valid`. Nothing in a file depends on the clock, the
+machine, the number of threads or the path.
 """
 
 from __future__ import annotations
@@ -225,25 +226,6 @@ def _check_columns(path: Path, artefact: str, schema: pa.Schema) -> None:
         raise InputError(path, f"unknown columns {', '.join(unknown)}", hint)
 
 
-_REQUIRED_METADATA: dict[str, tuple[str, ...]] = {
-    "trajectories": ("frames",),
-    "tpog": ("grid", "frames", "block_frames", "memory_frames"),
-    "scans": ("sites",),
-    "visibility": ("grid", "sites"),
-    "blindspots": ("sites", "cells", "points"),
-    "zones": ("sites", "zones"),
-    "plan_zones": ("inputs", "stages"),
-    "accuracy": ("inputs", "tolerance", "stages"),
-    "placement": ("inputs", "stages", "plan"),
-    "curve": ("inputs", "stages", "plan"),
-    "city_plan": ("inputs", "plan"),
-    "city_curve": ("inputs", "plan"),
-    "detection": ("inputs", "frames", "stages"),
-    "fused": ("inputs", "frames", "shown"),
-    "correlation": ("inputs", "frames", "stages", "own_score", "shown", "ranking"),
-}
-"""Keys that readers of an artefact need in its metadata."""
-
 _SITE_KEYS = ("site", "x_m", "y_m", "z_m", "sensor")
 
 _PLAN_KEYS = ("candidates", "joint", "together", "value", "bound", "certificate", "cost")
@@ -266,20 +248,28 @@ def _parse_metadata(path: Path, artefact: str, content: bytes) -> dict[str, Any]
     if metadata.get("schema") != SCHEMA_VERSION:
         problem = f"expected schema version {SCHEMA_VERSION}, got {metadata.get('schema')}"
         raise InputError(path, problem, _REMAKE_HINT)
-    required = _REQUIRED_METADATA.get(artefact, ())
+    required = _table_schema(artefact).get("metadata", {})
     if artefact == "tpog" and "periods" in metadata:  # each period has blocks of its own
-        required = ("grid", "frames", "periods")
-    for key in required:
-        if not _is_valid(key, metadata.get(key)):
+        required = {"grid": "grid", "frames": "count", "periods": "periods"}
+    for key, kind in required.items():
+        if not _is_valid(kind, metadata.get(key)):
             raise InputError(path, f"invalid metadata: {key} = {metadata.get(key)!r}", _REMAKE_HINT)
-    if artefact == "tpog" and not _is_valid(_SEEDS_KEY, metadata.get(_SEEDS_KEY, 1)):
+    if artefact == "tpog" and not _is_valid("count", metadata.get(_SEEDS_KEY, 1)):
         raise InputError(path, f"invalid metadata: {_SEEDS_KEY} = {metadata[_SEEDS_KEY]!r}", _REMAKE_HINT)
     return metadata
 
 
-def _is_valid(key: str, value: Any) -> bool:
-    """Whether a metadata key has a valid value."""
-    match key:
+def _is_valid(kind: str, value: Any) -> bool:
+    """Whether a value of the metadata is of a kind that a schema names."""
+    match kind:
+        case "string":
+            return isinstance(value, str)
+        case "object":
+            return isinstance(value, dict)
+        case "count":
+            return isinstance(value, int) and not isinstance(value, bool) and value > 0
+        case "quantity":
+            return isinstance(value, float) and 0 < value < math.inf
         case "grid":
             return _is_grid(value)
         case "cells":
@@ -292,13 +282,7 @@ def _is_valid(key: str, value: Any) -> bool:
             return isinstance(value, list) and bool(value) and all(_is_period(period) for period in value)
         case "plan":
             return _has_keys(value, _PLAN_KEYS) and all(_is_number(value[name]) for name in _PLAN_KEYS)
-        case "inputs":
-            return isinstance(value, str)
-        case "stages" | "own_score" | "shown" | "ranking":
-            return isinstance(value, dict)
-        case "tolerance" | "memory_frames" | "points":
-            return isinstance(value, float) and 0 < value < math.inf
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+    raise ValueError(f"a schema names an unknown kind of metadata, {kind!r}")
 
 
 def _has_keys(value: Any, keys: Sequence[str]) -> bool:
@@ -312,7 +296,7 @@ def _is_number(value: Any) -> bool:
 def _is_period(value: Any) -> bool:
     if not isinstance(value, dict) or value.keys() - {_SEEDS_KEY} != _PERIOD_TYPES.keys():
         return False
-    if not _is_valid(_SEEDS_KEY, value.get(_SEEDS_KEY, 1)):
+    if not _is_valid("count", value.get(_SEEDS_KEY, 1)):
         return False
     for key, expected_type in _PERIOD_TYPES.items():
         if type(value[key]) is not expected_type:

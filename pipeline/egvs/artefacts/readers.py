@@ -326,7 +326,7 @@ def read_accuracy(path: str | Path) -> tuple[Rows, dict[str, Any]] | None:
     path = Path(path)
     if not path.is_file():
         return None
-    study = _read_study([path], RunFolder.accuracy_checksums.name, "an accuracy study", "egvs accuracy")
+    study = read_study([path], RunFolder.accuracy_checksums.name, "an accuracy study", "egvs accuracy")
     return study[0]
 
 
@@ -338,7 +338,7 @@ def read_placement(placement: str | Path, curve: str | Path) -> tuple[Rows, Rows
     paths = [Path(placement), Path(curve)]
     if not all(path.is_file() for path in paths):
         return None
-    (rows, metadata), (points, curve_metadata) = _read_study(
+    (rows, metadata), (points, curve_metadata) = read_study(
         paths, RunFolder.placement_checksums.name, "a plan", "egvs place"
     )
     if metadata != curve_metadata:
@@ -346,24 +346,23 @@ def read_placement(placement: str | Path, curve: str | Path) -> tuple[Rows, Rows
     return rows, points, metadata
 
 
-def read_validation(detection: str | Path, correlation: str | Path) -> tuple[Rows, Rows, dict[str, Any]] | None:
-    """Return the rows of ``detection.parquet`` and of ``correlation.parquet``, and the metadata of the latter.
+def read_study(paths: list[Path], checksum_file: str, what: str, command: str) -> list[tuple[Rows, dict[str, Any]]]:
+    """Return the rows and the metadata of each file of a study.
 
-    None where one of them does not exist, or they belong to different validations.
+    Parameters
+    ----------
+    paths
+        The files, in one folder. Their names are those of their schemas.
+    checksum_file
+        Name of the file with their checksums, beside them.
+    what, command
+        The study and the command that makes it, for messages: "a plan", "egvs place".
+
+    Raises
+    ------
+    InputError
+        When a file was changed, or is corrupt.
     """
-    paths = [Path(detection), Path(correlation)]
-    if not all(path.is_file() for path in paths):
-        return None
-    (detected, detection_metadata), (correlated, metadata) = _read_study(
-        paths, RunFolder.validation_checksums.name, "a validation", "egvs validate"
-    )
-    if detection_metadata["inputs"] != metadata["inputs"]:
-        return None
-    return detected, correlated, metadata
-
-
-def _read_study(paths: list[Path], checksum_file: str, what: str, command: str) -> list[tuple[Rows, dict[str, Any]]]:
-    """Rows and metadata of the files of a study; InputError where they were changed."""
     checksums.verify_checksums(paths[0].with_name(checksum_file), f"Remove it, or run {command} again.")
     study = []
     for path in paths:

@@ -1,17 +1,28 @@
 """The folder of a run: the name of each file in it.
 
-:class:`RunFolder` is the only place where file names are written.
+:class:`RunFolder` declares the files of the core. Extensions declare theirs as tuples of :class:`RunFile`, entry points
+of the group ``egvs.files``, so that no run overwrites a user's file of the same name, and ``egvs verify`` finds their
+checksums.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import overload
+
+from egvs.core import plugins
+
+GROUP = "egvs.files"
+"""The group of entry points."""
 
 STAGE_NAMES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
 """In the order of execution. Errors are reported in this order as well, although SUMO starts before the check ends."""
 
+
+CHECKSUM_SUFFIX = ".sha256"
+"""Suffix of files with checksums; each study has one."""
 
 RUNS = Path("runs")
 """The folder of all runs for which no other is given."""
@@ -79,20 +90,11 @@ class RunFolder:
     accuracy = RunFile("accuracy.parquet", "accuracy")
     accuracy_figure = RunFile("accuracy.png", "accuracy")
     accuracy_checksums = RunFile("accuracy.sha256", "accuracy")
-    detection = RunFile("detection.parquet", "validate")
-    correlation = RunFile("correlation.parquet", "validate")
-    validation_figure = RunFile("validation.png", "validate")
-    surrogates = RunFile("surrogates.parquet", "validate")
-    fused = RunFile("fused.parquet", "validate")
-    validation_checksums = RunFile("validation.sha256", "validate")
     placement = RunFile("placement.parquet", "place")
     curve = RunFile("curve.parquet", "place")
     plan_zones = RunFile("plan_zones.parquet", "place")
     placement_checksums = RunFile("placement.sha256", "place")
     what_if = RunFile("what_if.json", "what-if")
-    sheets = RunFile("sheets.json", "sheets")
-    acceptance = RunFile("acceptance.json", "accept")
-    sensor_design = RunFile("sensor_design.json", "sensor design")
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -104,14 +106,24 @@ class RunFolder:
         return str(self.path)
 
     @classmethod
-    def all_files(cls) -> tuple[RunFile, ...]:
-        """Every file that a run or a study can write, in the order of the declarations above."""
+    def core_files(cls) -> tuple[RunFile, ...]:
+        """Every file that a run or a study of the core can write, in the order of the declarations above."""
         return tuple(value for value in vars(cls).values() if isinstance(value, RunFile))
 
     @classmethod
-    def written_by(cls, writer: str) -> tuple[RunFile, ...]:
-        """Return the files, and the folders, that a stage or a command can write."""
-        return tuple(file for file in cls.all_files() if file.writer == writer)
+    def all_files(cls) -> tuple[RunFile, ...]:
+        """Every file that the core or an extension can write."""
+        return cls.core_files() + extension_files()
+
+    @classmethod
+    def checksum_files(cls) -> tuple[RunFile, ...]:
+        """Return the files with checksums of studies."""
+        return tuple(file for file in cls.all_files() if file.name.endswith(CHECKSUM_SUFFIX))
+
+    @classmethod
+    def written_by(cls, stage: str) -> tuple[RunFile, ...]:
+        """Return the files, and the folders, that a stage can write."""
+        return tuple(file for file in cls.core_files() if file.writer == stage)
 
     @property
     def has_record(self) -> bool:
@@ -122,11 +134,29 @@ class RunFolder:
 ACCURACY_FILES = (RunFolder.accuracy.name, RunFolder.accuracy_figure.name)
 """Files of an accuracy study. The report shows them if their settings and inputs are those of the run."""
 
-VALIDATION_FILES = (RunFolder.detection.name, RunFolder.correlation.name, RunFolder.validation_figure.name)
-"""Files of a validation, shown likewise."""
-
 PLACEMENT_FILES = (RunFolder.placement.name, RunFolder.curve.name)
 """Files of a plan, shown likewise."""
 
-COMMAND_RESULTS = (RunFolder.what_if, RunFolder.sheets, RunFolder.acceptance, RunFolder.sensor_design)
-"""Results of commands that work on a finished run (:mod:`egvs.artefacts.command_results`), shown likewise."""
+
+@cache
+def extension_files() -> tuple[RunFile, ...]:
+    """Return the files of all extensions, in the order of their entry points.
+
+    Raises
+    ------
+    MissingBackendError
+        When an entry point cannot be loaded, is no tuple of :class:`RunFile`, or has a name twice or one of the core.
+    """
+    files: list[RunFile] = []
+    names = {file.name for file in RunFolder.core_files()}
+    for extension in plugins.plugin_names(GROUP):
+        declared = plugins.load_plugin(GROUP, extension)
+        if not (isinstance(declared, tuple) and all(isinstance(file, RunFile) for file in declared)):
+            problem = f"expected a tuple of {RunFile.__module__}.{RunFile.__name__}, got {declared!r}"
+            raise plugins.plugin_error(GROUP, extension, problem)
+        for file in declared:
+            if file.name in names:
+                raise plugins.plugin_error(GROUP, extension, f"{file.name} is a file of another part of the program")
+            names.add(file.name)
+            files.append(file)
+    return tuple(files)

@@ -107,7 +107,7 @@ def _print_ranking(
 ) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
     print_sentences([verdict(ranked, ranking_text.recorded_frames_hint(scenario, ranked, record.stages))])
-    for part in read_sections(RunFolder(folder), record.stages):
+    for part in read_sections(RunFolder(folder), scenario, record.stages):
         for warning in part.warnings:
             print_sentences([f"{warning.sentence} See {RunFolder(folder).report}#{part.section.name}"])
     summary = record.stages["score"].summary

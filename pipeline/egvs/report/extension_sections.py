@@ -1,7 +1,8 @@
 """Sections of the page that extensions provide: entry points of the group ``egvs.report_sections``.
 
-A section shows what a command of the extension found for a run. It has a template and files of the run folder, which
-count in the key of the report, and may warn at the head of the page and at the end of ``egvs run``.
+A section shows what a command of the extension found for a run. It has a template and files of the run folder, and may
+warn at the head of the page and at the end of ``egvs run``. All that it can show counts in the key of the report
+(:func:`section_dependencies`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
-from egvs.core import plugins
+from egvs.core import files, plugins
+from egvs.scenario.model import Scenario
 
 GROUP = "egvs.report_sections"
 """The group of entry points."""
@@ -48,7 +50,7 @@ class ReportSection(Protocol):
     Attributes
     ----------
     name
-        Name of its anchor on the page.
+        Its name, which is that of the anchor to which its warnings link.
     files
         Names of the files in the run folder that it shows.
     template
@@ -59,7 +61,7 @@ class ReportSection(Protocol):
     files: tuple[str, ...]
     template: Path
 
-    def read(self, folder: RunFolder, stages: Mapping[str, StageRecord]) -> Any | None:
+    def read(self, folder: RunFolder, scenario: Scenario, stages: Mapping[str, StageRecord]) -> Any | None:
         """Return what the template shows; None if the folder has nothing that belongs to these stages."""
 
     def warnings(self, values: Any) -> Iterator[SectionWarning]:
@@ -113,15 +115,35 @@ def section_modules() -> tuple[str, ...]:
     return tuple(plugins.plugin_module(GROUP, name) for name in plugins.plugin_names(GROUP))
 
 
-def read_sections(folder: RunFolder, stages: Mapping[str, StageRecord]) -> tuple[SectionContents, ...]:
+def section_dependencies(folder: RunFolder, scenario: Scenario, stages: Mapping[str, StageRecord]) -> dict[str, Any]:
+    """Return what the sections depend on, apart from files of the run folder and their modules.
+
+    These are their templates. Where a section has a file to show, what belongs to the run depends on the scenario and
+    on the inputs of its stages.
+    """
+    sections = report_sections()
+    values: dict[str, Any] = {
+        "templates": {template_name(section): files.hash_file(section.template) for section in sections}
+    }
+    if any((folder / name).is_file() for section in sections for name in section.files):
+        values["scenario"] = files.hash_json(scenario.model_dump(mode="json"))
+        values["stages"] = {name: stage.inputs for name, stage in stages.items()}
+    return values
+
+
+def read_sections(
+    folder: RunFolder, scenario: Scenario, stages: Mapping[str, StageRecord]
+) -> tuple[SectionContents, ...]:
     """Return the sections that have something to show.
 
     Parameters
     ----------
     folder
         The run folder.
+    scenario
+        The scenario of the run.
     stages
         Records of the stages of the run.
     """
-    contents = (SectionContents(section, section.read(folder, stages)) for section in report_sections())
+    contents = (SectionContents(section, section.read(folder, scenario, stages)) for section in report_sections())
     return tuple(content for content in contents if content.values is not None)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, MIN_VEHICLES, PeriodRanking
-from egvs.artefacts.run_folder import ACCURACY_FILES, COMMAND_RESULTS, PLACEMENT_FILES, RunFolder
+from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord, traffic_summary
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
@@ -28,13 +28,12 @@ from egvs.drawing.basemap import network_file
 from egvs.drawing.run_figures import Figures
 from egvs.report.approach_fits import ApproachFit, compare_approaches
 from egvs.report.approach_map import busiest_counts, draw_approach_map
-from egvs.report.command_sections import CommandSections
 from egvs.report.extension_sections import (
     SectionContents,
     read_sections,
     report_sections,
+    section_dependencies,
     section_modules,
-    template_name,
 )
 from egvs.report.points_section import MAPPED_POLES, PointsSection
 from egvs.report.ranking_text import entropy_seen_note, headline, lead, recorded_frames_hint
@@ -52,9 +51,10 @@ from egvs.report.sections import (
 )
 from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, range_note
 from egvs.report.signal_diagram import signal_diagrams
+from egvs.report.what_if_section import WhatIfSection
 from egvs.report.zone_section import ZoneSection
 from egvs.results import labels as formatting
-from egvs.results.command_entries import current_entries
+from egvs.results.command_entries import Entries, current_entries, what_if_digest
 from egvs.results.map_credits import read_map_credits
 from egvs.results.plans import SensorPlan
 from egvs.results.ranking import RankedSite, Ranking, share_of_limit
@@ -85,7 +85,7 @@ _OPTIONAL_FILES = (
     RunFolder.plan_zones.name,
     *ACCURACY_FILES,
     *PLACEMENT_FILES,
-    *(file.name for file in COMMAND_RESULTS),
+    RunFolder.what_if.name,
 )
 
 _UNMODELLED = (
@@ -110,8 +110,8 @@ class PageContents:
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
     study, by_period, plan
         Results of other commands and of periods; None if those commands have not run.
-    commands
-        Results of what-ifs, sheets, acceptance checks and sensor design.
+    what_if
+        Results of what-ifs.
     zones, points
         Road users found in zones, and maps of points on target; None where the scenario has no zones or no lanes.
     movements
@@ -133,7 +133,7 @@ class PageContents:
     by_period: PeriodRanking | None = None
     plan: Mapping[str, Any] | None = None
     movements: Mapping[str, str] = field(default_factory=dict)
-    commands: CommandSections = field(default_factory=CommandSections)
+    what_if: WhatIfSection = field(default_factory=WhatIfSection)
     zones: ZoneSection | None = None
     points: PointsSection | None = None
     approaches: tuple[ApproachFit, ...] = ()
@@ -173,8 +173,8 @@ def dependencies(work: StageContext) -> StageDependencies:
         settings["counts"] = describe_counts(scenario, network_file(work.folder.path))
     if map_credits := read_map_credits(scenario):
         settings["map_credits"] = map_credits
-    if current := current_entries(work.folder, scenario, stages):
-        settings["command_results"] = {name: list(entries) for name, entries in current.items()}
+    if current := _current_what_ifs(work, stages):
+        settings["what_if"] = list(current)
     hashes: dict[str, str] = {}
     if scenario.scan.keep:
         names.append(RunFolder.scans.name)
@@ -200,7 +200,7 @@ def dependencies(work: StageContext) -> StageDependencies:
     costs = {name: [stage.cost.seconds, stage.cost.peak_mb] for name, stage in stages.items()}
     warnings = [stage.summary.get(WARNINGS_KEY, []) for stage in stages.values()]
     more = {"costs": costs, "summaries": summaries, "warnings": warnings}
-    more["sections"] = {template_name(section): files.hash_file(section.template) for section in report_sections()}
+    more["sections"] = section_dependencies(work.folder, scenario, stages)
     return StageDependencies(settings, hashes, more, section_modules())
 
 
@@ -230,6 +230,11 @@ def _recorded_stages(folder: Path) -> dict[str, StageRecord]:
         return {}
     recorded = RunRecord.read(folder).stages
     return {name: recorded[name] for name in STAGES if name in recorded}
+
+
+def _current_what_ifs(work: StageContext, stages: Mapping[str, StageRecord]) -> Entries:
+    """The answers of ``egvs what-if`` that belong to the run."""
+    return current_entries(work.folder.what_if, stages, lambda values: what_if_digest(work.scenario, values["tables"]))
 
 
 def run(work: StageContext, inputs: StageDependencies) -> Summary:
@@ -264,17 +269,13 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         study=study_values(work.folder, stages),
         by_period=PeriodRanking.read(out),
         plan=None if plan is None else plan_values(plan, ranking.sites, tpog, drawn.backdrop),
-        commands=CommandSections.of(
-            current_entries(work.folder, work.scenario, stages),
-            ranking.sites,
-            {mount.name: mount.pose for mount in mounts},
-        ),
+        what_if=WhatIfSection.of(_current_what_ifs(work, stages), ranking.sites[0]),
         movements=describe_counts(work.scenario, network_file(out)),
         zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
         points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
         approaches=approaches,
         approach_map=draw_approach_map(work.scenario, network_file(out)),
-        sections=read_sections(work.folder, stages),
+        sections=read_sections(work.folder, work.scenario, stages),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)

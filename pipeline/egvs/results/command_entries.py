@@ -1,4 +1,4 @@
-"""Results of commands that still belong to a run: what-ifs, installation sheets, acceptance checks, sensor design.
+"""Results of commands that still belong to a run.
 
 An entry of a file of results (:mod:`egvs.artefacts.command_results`) belongs to a run while the stages that it depends
 on have the same inputs, and its digest of further settings (:data:`DIGEST_KEY`) is the present one.
@@ -6,11 +6,11 @@ on have the same inputs, and its digest of further settings (:data:`DIGEST_KEY`)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 from egvs.artefacts.command_results import read_results
-from egvs.artefacts.run_folder import COMMAND_RESULTS, RunFolder
 from egvs.artefacts.run_record import StageRecord
 from egvs.core import files
 from egvs.core.digests import hash_input
@@ -22,6 +22,10 @@ DIGEST_KEY = "digest"
 
 Entries = Mapping[str, Mapping[str, Any]]
 """Values of the entries of a file, by name."""
+
+
+def no_digest(values: Mapping[str, Any]) -> None:
+    """Stand for the digest of entries that depend on stages only."""
 
 
 def what_if_digest(scenario: Scenario, tables: Iterable[str]) -> str | None:
@@ -40,36 +44,22 @@ def what_if_digest(scenario: Scenario, tables: Iterable[str]) -> str | None:
     return files.hash_json(values)
 
 
-def design_digest(scenario: Scenario) -> str:
-    """Return a hash of the settings of sensors, scores and effects, on which the design of a sensor depends."""
-    sensors = {name: sensor.model_dump(mode="json") for name, sensor in scenario.sensors.items()}
-    parts = [sensors, scenario.score.model_dump(mode="json"), scenario.effects.model_dump(mode="json")]
-    return files.hash_json(parts)
-
-
-def current_entries(folder: RunFolder, scenario: Scenario, stages: Mapping[str, StageRecord]) -> dict[str, Entries]:
-    """Return the entries that belong to a run, by file and name; files without one are left out.
+def current_entries(
+    path: Path, stages: Mapping[str, StageRecord], digest: Callable[[Mapping[str, Any]], str | None] = no_digest
+) -> Entries:
+    """Return the entries of a file of results that belong to a run; empty without any.
 
     Parameters
     ----------
-    folder, scenario
-        The run.
+    path
+        The file.
     stages
-        Its recorded stages.
+        Recorded stages of the run.
+    digest
+        Returns the present digest of the settings that the values of an entry depend on.
     """
-    current: dict[str, Entries] = {}
-    for file in COMMAND_RESULTS:
-        entries = {}
-        for name, result in read_results(folder.path / file.name).items():
-            if not result.is_current(stages):
-                continue
-            digest = None
-            if file is RunFolder.what_if:
-                digest = what_if_digest(scenario, result.values["tables"])
-            elif file is RunFolder.sensor_design:
-                digest = design_digest(scenario)
-            if digest == result.values.get(DIGEST_KEY):
-                entries[name] = result.values
-        if entries:
-            current[file.name] = entries
-    return current
+    entries = {}
+    for name, result in read_results(path).items():
+        if result.is_current(stages) and digest(result.values) == result.values.get(DIGEST_KEY):
+            entries[name] = result.values
+    return entries

@@ -13,9 +13,10 @@ the last step costs much and adds little. Without costs, the sensor that finds l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
+from typing import Any
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.results.labels import format_count
@@ -59,6 +60,11 @@ class ScoreDifference:
         else:
             better = 0.5 * (1.0 + math.copysign(1.0, value)) if value else 0.5
         return cls(value, se, round(better, _PROBABILITY_DIGITS))
+
+    @classmethod
+    def from_entry(cls, entry: Mapping[str, Any]) -> ScoreDifference:
+        """Return the paired difference that a command has recorded in the run folder."""
+        return cls(entry["value"], entry["se"], entry["better"], is_paired=True)
 
     @property
     def is_clear(self) -> bool:

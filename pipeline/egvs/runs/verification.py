@@ -99,9 +99,8 @@ def _changed_companions(folder: Path, record: RunRecord) -> Iterator[str]:
         for name in stage.companions:
             if (folder / name).is_file() and not _is_unchanged(folder, name, stage.companions):
                 yield f"{name} was altered after the run"
-    studies = (RunFolder.accuracy_checksums, RunFolder.validation_checksums, RunFolder.placement_checksums)
-    for study in studies:
-        for name in checksums.changed_files(folder / study.name, "Remove it."):
+    for file in RunFolder.checksum_files():
+        for name in checksums.changed_files(folder / file.name, "Remove it."):
             yield f"{name} was altered after the study that made it"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from egvs import load
 from egvs.artefacts import parquet
-from egvs.artefacts.readers import read_validation
+from egvs.artefacts.run_folder import RunFolder
 from egvs.core.errors import InputError
 from egvs.extensions.validation.correlation import CorrelationStudy, JunctionScores, MeasureValues
 from egvs.extensions.validation.detection_metrics import (
@@ -23,6 +23,7 @@ from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.detectors import base
 from egvs.extensions.validation.held_out_traffic import FrameSampling
 from egvs.extensions.validation.kitti_results import KittiFiles
+from egvs.extensions.validation.report_section import read_validation
 from egvs.extensions.validation.results import CORRELATED_BOX_MEASURES, CORRELATED_POINT_MEASURES, ScoreName
 from egvs.extensions.validation.site_validation import correlate_scores, validate_sites
 from egvs.extensions.validation.surrogates import SurrogateRow, Surrogates
@@ -75,13 +76,13 @@ def test_writes_artefacts(validated):
 
 def test_detects_flipped_bit(validated, tmp_path):
     out = shutil.copytree(validated[1], tmp_path / "out")
-    paths = out / "detection.parquet", out / "correlation.parquet"
-    assert read_validation(*paths) is not None
-    data = paths[0].read_bytes()
-    paths[0].write_bytes(data[:99] + bytes([data[99] ^ 1]) + data[100:])
+    assert read_validation(RunFolder(out)) is not None
+    path = out / "detection.parquet"
+    data = path.read_bytes()
+    path.write_bytes(data[:99] + bytes([data[99] ^ 1]) + data[100:])
     message = r"detection\.parquet: does not match its checksum in validation\.sha256\. Remove it, or run egvs val"
     with pytest.raises(InputError, match=message):
-        read_validation(*paths)
+        read_validation(RunFolder(out))
 
 
 def test_warns_if_traffic_is_not_held_out(validated):

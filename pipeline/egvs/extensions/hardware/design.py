@@ -41,8 +41,9 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
 from egvs.extensions.hardware.design_request import ALL_SENSORS, DesignRequest
+from egvs.extensions.hardware.files import SENSOR_DESIGN, design_digest
 from egvs.placement.refinement import Axis, BoxEnds, Freedom, minimise
-from egvs.results.command_entries import DIGEST_KEY, design_digest
+from egvs.results.command_entries import DIGEST_KEY
 from egvs.results.sensors import ScoreDifference
 from egvs.runs import run, stage_registry
 from egvs.runs.command_results import add_to_report
@@ -184,7 +185,7 @@ def design_sensor(
     _check_request(request)
     folder = Path(out) if out is not None else run.default_folder(scenario)
     names = _sensor_names(scenario, request)
-    read_results(RunFolder(folder).sensor_design)
+    read_results(RunFolder(folder) / SENSOR_DESIGN.name)
     record = run.run(scenario, folder, only=STAGES, jobs=jobs, progress=progress, listener=listener)
     recorded = stage_registry.recorded_digests(record)
     context = open_folder(scenario, folder, jobs=jobs, progress=progress, recorded=recorded)
@@ -221,7 +222,7 @@ def design_sensor(
         tuple(notes),
     )  # fmt: skip
     entry = {**_report_entry(result), DIGEST_KEY: design_digest(scenario)}
-    written = add_to_report(folder, RunFolder.sensor_design, {request.pole: entry}, STAGES)
+    written = add_to_report(folder, SENSOR_DESIGN, {request.pole: entry}, STAGES)
     if RunFolder(folder).report in written:
         return result
     note = "The report will show this once the run folder has current scores (egvs run)."

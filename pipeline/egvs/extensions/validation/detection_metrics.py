@@ -60,7 +60,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from egvs.artefacts import parquet
-from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.traffic_frames import BOX_COLUMNS, TrafficFrame
 from egvs.clouds.sweeps import BoolArray, Detections
 from egvs.core.errors import Diagnostic, InputError
@@ -89,8 +88,6 @@ IOUS = (0.7, 0.5)
 
 MEASURE_NAMES = ("ap_{}_r11", "ap_{}_r40", "recall_{}")
 """The measures of a view, in the order of :func:`ap_and_recall`."""
-
-DETECTION_TABLE = RunFolder.detection.name
 
 POINT_THRESHOLDS = (1, 5, 10, 20, 50)
 """Numbers of points from which a vehicle counts as visible."""

@@ -45,6 +45,7 @@ from egvs.extensions.validation.detector_runs import (
 )
 from egvs.extensions.validation.detectors import base
 from egvs.extensions.validation.detectors.base import JointDetector
+from egvs.extensions.validation.files import FUSED
 from egvs.extensions.validation.held_out_traffic import FrameSampling, HeldOutTraffic, TrafficSample
 from egvs.extensions.validation.results import main_measure
 from egvs.extensions.validation.validation_run import validation_metadata, validation_run
@@ -53,8 +54,6 @@ from egvs.runs import stage_keys
 from egvs.scenario.model import Scenario
 from egvs.sensors import sensor, sites
 from egvs.sensors.sites import Pose, Site
-
-FUSED_TABLE = "fused.parquet"
 
 _FIXED_SUBSETS = (ALL_OBJECTS, "cars")
 """Sets of objects that do not depend on the number of sensors."""
@@ -212,7 +211,7 @@ def validate_plan(
         results = run_detectors(plan.groups, task, jobs=jobs, progress=progress, listener=listener)
         rows, undefined = detection_metrics.measure_detection(run.frames, record.scene.roi, results)
         warnings = (*run.warnings, *_other_world_warnings(plan, record), *undefined)
-        validation = PlanValidation(plan, with_gains(plan.groups, rows), warnings, out / FUSED_TABLE, run.sample)
+        validation = PlanValidation(plan, with_gains(plan.groups, rows), warnings, out / FUSED.name, run.sample)
         write_fused(validation.path, validation.rows, _plan_metadata(scenario, record, validation))
         return validation
 

@@ -10,14 +10,18 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from egvs.artefacts.readers import read_validation
-from egvs.artefacts.run_folder import VALIDATION_FILES, RunFolder
+from egvs.artefacts.readers import Rows, read_study
+from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord, have_inputs
 from egvs.core.errors import Diagnostic, collect_warnings
-from egvs.extensions.validation.ranking_check import RankingCheck
+from egvs.extensions.validation.files import CHECKSUMS, CORRELATION, DETECTION, FIGURE
 from egvs.report.extension_sections import SectionWarning
+from egvs.scenario.model import Scenario
+
+if TYPE_CHECKING:
+    from egvs.extensions.validation.ranking_check import RankingCheck
 
 _ALL_OBJECTS = "vehicles"
 """Name of the set of all objects in ``detection.parquet``."""
@@ -106,12 +110,14 @@ class ValidationSummary:
     @classmethod
     def read(cls, folder: RunFolder, stages: Mapping[str, StageRecord]) -> ValidationSummary | None:
         """Read the validation in a run folder; None if there is none of this run."""
-        detection, correlation, figure = (folder.path / name for name in VALIDATION_FILES)
+        figure = folder / FIGURE.name
         if not figure.is_file():
             return None
-        result = read_validation(detection, correlation)
+        result = read_validation(folder)
         if result is None:
             return None
+        from egvs.extensions.validation.ranking_check import RankingCheck  # only where there is a validation
+
         detection_rows, _, metadata = result
         if not have_inputs(stages, metadata["stages"]):
             return None
@@ -126,6 +132,22 @@ class ValidationSummary:
             warnings=tuple(collect_warnings([metadata])),
             figure=base64.b64encode(figure.read_bytes()).decode("ascii"),
         )
+
+
+def read_validation(folder: RunFolder) -> tuple[Rows, Rows, dict[str, Any]] | None:
+    """Return the rows of ``detection.parquet`` and of ``correlation.parquet``, and the metadata of the latter.
+
+    None where one of them does not exist, or they belong to different validations.
+    """
+    paths = [folder / DETECTION.name, folder / CORRELATION.name]
+    if not all(path.is_file() for path in paths):
+        return None
+    (detected, detection_metadata), (correlated, metadata) = read_study(
+        paths, CHECKSUMS.name, "a validation", "egvs validate"
+    )
+    if detection_metadata["inputs"] != metadata["inputs"]:
+        return None
+    return detected, correlated, metadata
 
 
 def _detector_summary(name: str, measure: str, rows: Sequence[Mapping[str, Any]]) -> DetectorSummary:
@@ -149,11 +171,14 @@ class DetectedSection:
     """The section, as :class:`egvs.report.extension_sections.ReportSection` describes it."""
 
     name = "detected"
-    files = VALIDATION_FILES
+    files = (DETECTION.name, CORRELATION.name, FIGURE.name)
     template = Path(__file__).parent / "templates" / "detected.html.j2"
 
-    def read(self, folder: RunFolder, stages: Mapping[str, StageRecord]) -> ValidationSummary | None:
+    def read(
+        self, folder: RunFolder, scenario: Scenario, stages: Mapping[str, StageRecord]
+    ) -> ValidationSummary | None:
         """Return the validation of a run; None if there is none."""
+        del scenario
         return ValidationSummary.read(folder, stages)
 
     def warnings(self, values: ValidationSummary) -> Iterator[SectionWarning]:

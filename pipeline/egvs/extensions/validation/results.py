@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import Diagnostic
 from egvs.extensions.validation.correlation import Correlation
@@ -156,8 +155,6 @@ class Validation:
         key = (score, detector, measure)
         return next(row for row in self.agreements if (row.score, row.detector, row.measure) == key)
 
-
-FIGURE_FILE = RunFolder.validation_figure.name
 
 _PERCENT = 100.0
 _SIGMAS_95 = 1.96  # half width of a 95 % interval in standard errors

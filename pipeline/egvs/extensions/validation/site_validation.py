@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts import checksums, parquet
-from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
@@ -30,6 +29,7 @@ from egvs.extensions.validation.detection_metrics import ALL_OBJECTS, SiteDetect
 from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME, DetectedBoxes, detections_in_roi
 from egvs.extensions.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
 from egvs.extensions.validation.detectors import base
+from egvs.extensions.validation.files import CHECKSUMS, CORRELATION, DETECTION, FIGURE, SURROGATES
 from egvs.extensions.validation.held_out_traffic import FrameSampling, HeldOutTraffic
 from egvs.extensions.validation.kitti_results import NO_KITTI_FILES, KittiFiles
 from egvs.extensions.validation.ranking_evidence import SiteRanking
@@ -42,8 +42,6 @@ from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
 from egvs.statistics.ranks import COEFFICIENT_KINDS
-
-CORRELATION_TABLE = RunFolder.correlation.name
 
 BoxesBySite = Mapping[str, Mapping[str, DetectedBoxes]]
 """Boxes of other detectors, by site and detector."""
@@ -212,11 +210,11 @@ def _write_artefacts(
     metadata = _site_metadata(run, scenario, validation, external)
     folder = run.folder / "done"
     folder.mkdir()
-    detection_metrics.write_detection(folder / detection_metrics.DETECTION_TABLE, validation.detections, metadata)
-    validation.surrogates.write(folder / surrogates.SURROGATES_TABLE, scenario)
-    _write_correlation(folder / CORRELATION_TABLE, validation, metadata)
-    results.write_figure(folder / results.FIGURE_FILE, scenario, validation)
-    checksums.write_checksums(RunFolder(folder).validation_checksums, sorted(folder.iterdir()))
+    detection_metrics.write_detection(folder / DETECTION.name, validation.detections, metadata)
+    validation.surrogates.write(folder / SURROGATES.name, scenario)
+    _write_correlation(folder / CORRELATION.name, validation, metadata)
+    results.write_figure(folder / FIGURE.name, scenario, validation)
+    checksums.write_checksums(folder / CHECKSUMS.name, sorted(folder.iterdir()))
     for path in sorted(folder.iterdir()):
         path.replace(out / path.name)
 

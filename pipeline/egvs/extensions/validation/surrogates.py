@@ -326,7 +326,6 @@ def _score_entry(name: str) -> ScoreEntry:
 
 # ---- table of results
 
-SURROGATES_TABLE = "surrogates.parquet"
 _TRAJECTORIES_FILE = "trajectories.parquet"
 
 

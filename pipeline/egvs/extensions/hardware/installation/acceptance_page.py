@@ -20,6 +20,7 @@ from egvs.drawing import colours, pages
 from egvs.drawing.colours import IndexedImage
 from egvs.drawing.svg_figures import ColourBar, svg_start_tag
 from egvs.export.export import safe_file_name
+from egvs.extensions.hardware.files import ACCEPTANCE
 from egvs.extensions.hardware.installation.acceptance import Acceptance, describe_error
 from egvs.extensions.hardware.installation.planned_sites import path_in_run
 from egvs.extensions.hardware.installation.scan_comparison import NEARER_M, NEARER_SHARE, SURE_RANGE, ScanComparison
@@ -97,14 +98,14 @@ def write_acceptance(run: str | Path, result: Acceptance, out: Path | None = Non
         If a file cannot be written, or the file with the verdicts is damaged.
     """
     folder = RunFolder(Path(run))
-    read_results(folder.acceptance)
+    read_results(folder / ACCEPTANCE.name)
     written = write_files(out or folder.path / "acceptance", result)
     entry = {
         **result.to_json(),
         "pose": asdict(result.pose.planned),
         "path": path_in_run(written.page, folder),
     }
-    reported = add_to_report(folder.path, RunFolder.acceptance, {result.site.name: entry})
+    reported = add_to_report(folder.path, ACCEPTANCE, {result.site.name: entry})
     return (written.json, written.page, *reported)
 
 

@@ -35,6 +35,7 @@ from egvs.drawing.svg_figures import Box, FigureStyle, MapFrame, svg_start_tag
 from egvs.export.export import safe_file_name
 from egvs.export.figure import convert_svg
 from egvs.export.finished_run import SCENARIO_CRS, ExportCrs
+from egvs.extensions.hardware.files import SHEETS
 from egvs.extensions.hardware.installation import tolerances, view
 from egvs.extensions.hardware.installation.planned_sites import PlannedSites, path_in_run
 from egvs.extensions.hardware.installation.tolerances import PoseTolerances, Tolerance
@@ -274,7 +275,7 @@ def write_sheets(
         plugins.require_libraries(f"a {kind} sheet", "figure", "cairosvg")
     planned = PlannedSites.open(Path(run))
     run_folder = planned.run.work.folder
-    read_results(run_folder.sheets)
+    read_results(run_folder / SHEETS.name)
     names = tuple(dict.fromkeys(sites)) or planned.default_sites
     for name in names:
         planned.site(name)
@@ -291,7 +292,7 @@ def write_sheets(
         written.append((data, path))
         progress("sheets", number, len(names))
     entries = {data.site.name: _report_entry(data, path, run_folder) for data, path in written}
-    add_to_report(run_folder.path, RunFolder.sheets, entries)
+    add_to_report(run_folder.path, SHEETS, entries)
     return written
 
 

@@ -1,4 +1,4 @@
-"""Sections of the page on what-ifs, installation sheets, acceptance checks and sensor design.
+"""The section of the report on installed and designed sensors: sensor design, installation sheets, acceptance checks.
 
 An entry is shown while it belongs to the run (:mod:`egvs.results.command_entries`). A site must still have the pose of
 the sheet, or the planned one of the acceptance check.
@@ -7,34 +7,25 @@ the sheet, or the planned one of the acceptance check.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
-from egvs.artefacts.run_folder import RunFile, RunFolder
-from egvs.core.wording import format_percent
-from egvs.results.command_entries import Entries
-from egvs.results.labels import SCORE_LABELS, format_probability
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import StageRecord
+from egvs.extensions.hardware.files import ACCEPTANCE, FILES, SENSOR_DESIGN, SHEETS, design_digest
+from egvs.report.extension_sections import SectionWarning
+from egvs.results.command_entries import Entries, current_entries
+from egvs.results.labels import SCORE_LABELS
+from egvs.results.plans import SensorPlan
 from egvs.results.ranking import RankedSite
-from egvs.results.sensors import ScoreDifference, difference_unit, format_difference
+from egvs.results.sensors import ScoreDifference
+from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.sensors.sites import Pose
 
 _POSE_TOLERANCE = 1e-6
-
-
-@dataclass(frozen=True)
-class WhatIfRow:
-    """The answer of one table of solids, in words."""
-
-    name: str
-    share: str
-    best_before: str
-    best_present: str
-    best_expected: str
-    change: str
-    chance: str
-    conclusion: str
 
 
 @dataclass(frozen=True)
@@ -89,50 +80,46 @@ class DesignTable:
 
 
 @dataclass(frozen=True)
-class CommandSections:
-    """Results of ``egvs what-if``, ``sheets``, ``accept`` and ``sensor design`` for a run; empty without any."""
+class HardwareResults:
+    """Results of ``egvs sensor design``, ``sheets`` and ``accept`` for a run."""
 
-    what_ifs: tuple[WhatIfRow, ...] = ()
-    change_unit: str = ""
-    installations: tuple[InstallationRow, ...] = ()
-    acceptances: tuple[AcceptanceRow, ...] = ()
-    designs: tuple[DesignTable, ...] = ()
+    designs: tuple[DesignTable, ...]
+    installations: tuple[InstallationRow, ...]
+    acceptances: tuple[AcceptanceRow, ...]
 
     @classmethod
-    def of(
-        cls, current: Mapping[str, Entries], sites: Iterable[RankedSite], plan: Mapping[str, Pose]
-    ) -> CommandSections:
-        """Return the results of a run in words.
-
-        Parameters
-        ----------
-        current
-            The entries that belong to the run, by file and name.
-        sites
-            The ranked sites, at least one.
-        plan
-            Poses of the sensors of the plan, by site.
-        """
-        ranked = tuple(sites)
-        poses = {site.site: site.pose for site in ranked} | dict(plan)
-
-        def entries(file: RunFile) -> Entries:
-            return current.get(file.name, {})
-
-        def installed(file: RunFile) -> Entries:
-            return {name: value for name, value in entries(file).items() if _is_at(value["pose"], poses.get(name))}
-
-        what_ifs = entries(RunFolder.what_if)
+    def read(cls, folder: RunFolder, scenario: Scenario, stages: Mapping[str, StageRecord]) -> HardwareResults | None:
+        """Read the results in a run folder; None if there are none of this run."""
+        designs = current_entries(folder / SENSOR_DESIGN.name, stages, lambda _: design_digest(scenario))
+        sheets = current_entries(folder / SHEETS.name, stages)
+        checks = current_entries(folder / ACCEPTANCE.name, stages)
+        if sheets or checks:
+            poses = _present_poses(folder, stages)
+            sheets, checks = _at_present_poses(sheets, poses), _at_present_poses(checks, poses)
+        if not (designs or sheets or checks):
+            return None
         return cls(
-            tuple(_what_if_row(name, values, ranked[0]) for name, values in what_ifs.items()),
-            difference_unit(ranked[0]),
-            tuple(_installation_row(name, values) for name, values in installed(RunFolder.sheets).items()),
+            tuple(_design_table(name, values) for name, values in designs.items()),
+            tuple(_installation_row(name, values) for name, values in sheets.items()),
             tuple(
                 AcceptanceRow(name, values["sensor"], values["passed"], tuple(values["reasons"]), values["path"])
-                for name, values in installed(RunFolder.acceptance).items()
+                for name, values in checks.items()
             ),
-            tuple(_design_table(name, values) for name, values in entries(RunFolder.sensor_design).items()),
         )
+
+
+def _present_poses(folder: RunFolder, stages: Mapping[str, StageRecord]) -> dict[str, Pose]:
+    """Return the poses of the sites of a run; a site of its plan has the planned one."""
+    poses = {site.site: site.pose for site in RankedSite.read(folder.scores)}
+    plan = SensorPlan.read(folder)
+    if plan is not None and plan.belongs_to(stages):
+        poses |= {sensor.mount.name: sensor.mount.pose for sensor in plan.sensors}
+    return poses
+
+
+def _at_present_poses(entries: Entries, poses: Mapping[str, Pose]) -> Entries:
+    """Return the entries of the sites that have their recorded pose."""
+    return {name: values for name, values in entries.items() if _is_at(values["pose"], poses.get(name))}
 
 
 def _is_at(recorded: Mapping[str, float], pose: Pose | None) -> bool:
@@ -143,24 +130,6 @@ def _is_at(recorded: Mapping[str, float], pose: Pose | None) -> bool:
         math.isclose(recorded[name], value, rel_tol=0.0, abs_tol=_POSE_TOLERANCE)
         for name, value in asdict(pose).items()
     )
-
-
-def _difference(value: Mapping[str, Any]) -> ScoreDifference:
-    return ScoreDifference(value["value"], value["se"], value["better"], is_paired=True)
-
-
-def _what_if_row(name: str, values: Mapping[str, Any], site: RankedSite) -> WhatIfRow:
-    change, chance = "not possible with it", "certain"
-    if values["change"] is not None:
-        change = format_difference(_difference(values["change"]), site)
-        chance = "–"
-        if values["overtakes"] is not None:
-            chance = f"{format_probability(values['overtakes'])} ({values['rival']})"
-    share = "–" if values["share"] is None else format_percent(values["share"], 0)
-    return WhatIfRow(
-        name, share, values["best_before"], values["best_present"] or "–", values["best_expected"], change, chance,
-        values["conclusion"],
-    )  # fmt: skip
 
 
 def _installation_row(name: str, values: Mapping[str, Any]) -> InstallationRow:
@@ -181,7 +150,7 @@ def _design_table(pole: str, values: Mapping[str, Any]) -> DesignTable:
     label = SCORE_LABELS[DEFAULT_SCORE]
     rows = []
     for design in values["designs"]:
-        difference = _difference(design["difference"])
+        difference = ScoreDifference.from_entry(design["difference"])
         gain = f"{100 * difference.value:+z.1f}"
         if difference.se is not None:
             gain += f" ± {100 * difference.se:.1f}"
@@ -197,3 +166,22 @@ def _design_table(pole: str, values: Mapping[str, Any]) -> DesignTable:
         )  # fmt: skip
     search, others = values["frames"]
     return DesignTable(pole, values["designs"][0]["sensor"], search, others, tuple(rows), tuple(values["notes"]))
+
+
+class HardwareSection:
+    """The section, as :class:`egvs.report.extension_sections.ReportSection` describes it."""
+
+    name = "hardware"
+    files = tuple(file.name for file in FILES)
+    template = Path(__file__).parent / "templates" / "hardware.html.j2"
+
+    def read(self, folder: RunFolder, scenario: Scenario, stages: Mapping[str, StageRecord]) -> HardwareResults | None:
+        """Return the results that belong to a run; None if there are none."""
+        return HardwareResults.read(folder, scenario, stages)
+
+    def warnings(self, values: HardwareResults) -> Iterator[SectionWarning]:
+        """Yield none: no result here contradicts the ranking."""
+        yield from ()
+
+
+SECTION = HardwareSection()
