@@ -135,6 +135,14 @@ def test_message_of_broken_reader_names_its_package(site: Path, source: str, pro
         readers.load_reader(walls, ("read_solids", "read_roads"), "a map")
 
 
+@pytest.mark.parametrize("group", readers.FORMER_GROUPS)
+def test_message_of_former_group_names_the_new_one(site: Path, group: str) -> None:  # noqa: F811
+    install(site, "old-package", "walls = plug_old", {}, group)
+    message = rf"the group {group} is now egvs\.readers.*\(entry point 'plug_old' of the package old-package\)"
+    with pytest.raises(MissingBackendError, match=message):
+        readers.list_readers("map")
+
+
 def test_rejects_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"missing\.osm: no such file"):
         readers.find_reader("map", tmp_path / "missing.osm")

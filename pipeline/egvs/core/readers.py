@@ -26,6 +26,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import IO, Any, cast
@@ -36,6 +37,8 @@ from egvs.core.errors import InputError, MissingBackendError
 
 GROUP = "egvs.readers"
 
+FORMER_GROUPS = ("egvs.maps", "egvs.point_clouds", "egvs.tracks")
+"""Groups of entry points that named readers before there was one table."""
 
 KINDS = ("map", "tracks", "points", "sweeps")
 """What a file can hold."""
@@ -194,6 +197,7 @@ def read_head(path: Path) -> bytes:
 @cache
 def _table() -> dict[Reader, str]:
     """Return all readers in the order in which they are asked, each with the name of its entry point."""
+    _reject_former_groups()
     own: dict[Reader, str] = {}
     others: dict[Reader, str] = {}
     for name in plugins.plugin_names(GROUP):
@@ -208,6 +212,13 @@ def _table() -> dict[Reader, str]:
 
 def _is_without_content(item: tuple[Reader, str]) -> bool:
     return item[0].content is None
+
+
+def _reject_former_groups() -> None:
+    for group in FORMER_GROUPS:
+        for entry in entry_points(group=group):
+            problem = f"the group {group} is now {GROUP}, whose entry points name a tuple of readers"
+            raise plugins.plugin_error(group, entry.name, problem)
 
 
 def _confirms(reader: Reader, path: Path, head: bytes) -> bool:
