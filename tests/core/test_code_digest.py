@@ -49,9 +49,9 @@ def imports_by_syntax_tree(text: str, package: str) -> set[str]:
 def test_import_pattern_matches_syntax_tree(path: Path) -> None:
     text, package = path.read_text(encoding="utf-8"), "egvs.x"
     assert imports_by_syntax_tree(text, package) <= set(stage_keys.imported_names(text, package))
-    assert set(stage_keys.imported_names(text, package)) - imports_by_syntax_tree(text, package) <= {
-        "egvs"
-    }  # in docstrings
+    others = set(stage_keys.imported_names(text, package)) - imports_by_syntax_tree(text, package)
+    in_docstring = {name for name in others if path.name == "__init__.py" and name.startswith("egvs.extensions")}
+    assert others - in_docstring <= {"egvs"}
 
 
 KINDS_OF_IMPORT = """
@@ -164,27 +164,16 @@ def test_library_versions_are_those_installed() -> None:
     assert "numba" not in stage_keys.source_digest("egvs.stages.statics").libraries
 
 
-SOURCE_BEFORE = {
-    "check": 9046,
-    "statics": 6016,
-    "scan": 7214,
-    "traffic": 5694,
-    "tpog": 2692,
-    "score": 10538,
-    "report": 10404,
+MOST_LINES = {
+    "check": 15_000,
+    "statics": 9_500,
+    "scan": 11_300,
+    "traffic": 9_800,
+    "tpog": 4_000,
+    "score": 16_000,
+    "report": 19_100,
 }
-"""Code lines behind the key of each stage before the layout with one module per subject."""
-
-GROWTH = {
-    "check": 1.59,
-    "statics": 1.49,
-    "scan": 1.47,
-    "traffic": 1.86,
-    "tpog": 1.46,
-    "score": 1.46,
-    "report": 1.77,
-}
-"""Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
+"""Code lines behind the key of each stage, at most: a stage runs again whenever one of them changes."""
 
 
 def code_lines(path: Path) -> int:
@@ -202,11 +191,11 @@ def code_lines(path: Path) -> int:
     )
 
 
-@pytest.mark.parametrize("name", SOURCE_BEFORE)
+@pytest.mark.parametrize("name", MOST_LINES)
 def test_source_behind_stage_key_stays_small(name: str) -> None:
     stage = stage_registry.stage(name)
     modules = [module for module in stage_keys.source_modules(stage.module, *stage.code) if module.startswith("egvs")]
     paths = [stage_keys._module_path(module) for module in modules]
     # An __init__.py lists public names and computes nothing.
     total = sum(code_lines(path) for path in paths if path is not None and path.name != "__init__.py")
-    assert total <= GROWTH.get(name, 1.1) * SOURCE_BEFORE[name]
+    assert total <= MOST_LINES[name]
