@@ -20,7 +20,8 @@ import pyarrow.parquet as pq
 
 IGNORED_KEYS = (
     "cost", "created", "duration_s", "host", "inputs", "key", "keys", "kilobytes", "own_sha256", "pandas",
-    "peak_memory_bytes", "program", "scenario_folder", "seconds", "stage_key", "started", "sumo_peak_mb", "sumo_seconds", "version",
+    "peak_memory_bytes", "program", "scenario_folder", "seconds", "stage_key", "started",
+    "sumo_peak_mb", "sumo_seconds", "version",
 )  # fmt: skip
 """Keys of JSON and of Parquet metadata that differ between any two runs or versions."""
 
