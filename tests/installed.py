@@ -1,13 +1,15 @@
-"""Marks of tests of the core that also use an extension: without it, they are skipped."""
+"""Marks of tests of the core that also use extensions: without them, they are skipped."""
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import pytest
 
-from egvs.cli.commands import GROUP
-from egvs.core import plugins
+EXTENSIONS = ("city", "hardware", "maps", "tracks", "validation")
 
 
-def needs(extension: str) -> pytest.MarkDecorator:
-    """Return the mark of a test that uses commands of an extension."""
-    return pytest.mark.skipif(extension not in plugins.plugin_names(GROUP), reason=f"needs the extension {extension}")
+def needs(*extensions: str) -> pytest.MarkDecorator:
+    """Return the mark of a test that uses extensions."""
+    missing = [name for name in extensions if find_spec(f"egvs.extensions.{name}") is None]
+    return pytest.mark.skipif(bool(missing), reason=f"needs the extensions {', '.join(missing)}")

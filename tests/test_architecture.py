@@ -17,6 +17,7 @@ import egvs
 from egvs.artefacts.run_folder import extension_files
 from egvs.core import plugins
 from tests import platform_tests, public_names
+from tests.installed import EXTENSIONS, needs
 from tests.public_names import run_folder, run_python  # noqa: F401 - a fixture
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -38,6 +39,7 @@ def imported_names(name: str) -> set[str]:
 # ---- imports
 
 
+@needs(*EXTENSIONS)
 def test_import_contracts_hold(capsys: pytest.CaptureFixture[str]) -> None:
     broken = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
     assert not broken, capsys.readouterr().out
@@ -83,6 +85,7 @@ def test_run_imports_only_declarations_of_extensions(tmp_path: Path) -> None:
     code = """
 import sys
 from egvs.cli.app import app
+from tests.installed import EXTENSIONS, needs
 for _ in range(2):
     try:
         app(["run", "demo", "--out", "out", "--set", "traffic.frames=50"])

@@ -61,6 +61,7 @@ JUDGING = (
     "egvs.kernels.vehicle_visibility",
     "egvs.scoring.targets",
     "egvs.scoring.visibility",
+    "egvs.statistics.ranks",
     "egvs.extensions.validation.correlation",
     "egvs.extensions.validation.detection_metrics",
     "egvs.extensions.validation.surrogate_scores",

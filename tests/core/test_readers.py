@@ -12,6 +12,7 @@ from egvs.core import limits, readers
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.core.readers import Reader
 from tests.core.test_plugins import install, install_readers, site  # noqa: F401  the fixture
+from tests.installed import needs
 
 DATA = Path("data.bin")
 
@@ -90,6 +91,7 @@ def test_module_decides_where_the_table_cannot(site: Path) -> None:  # noqa: F81
         assert found is not None and found.name == name
 
 
+@needs("maps")
 def test_content_comes_first_and_no_package_replaces_a_reader_of_this_program(site: Path) -> None:  # noqa: F811
     by_name = "Reader('by name', 'map', 'plug_a', suffixes=('.w', '.osm'))"
     rows = f"{by_name}, Reader('zz', 'map', 'plug_b', suffixes=('.w',), content=b'z')"

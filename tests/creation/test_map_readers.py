@@ -9,6 +9,7 @@ from egvs.core import readers
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.creation import map_readers
 from tests.core.test_plugins import install_readers, site  # noqa: F401  the fixture
+from tests.installed import needs
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 NETWORK = SCENARIOS / "roundabout" / "network.net.xml"
@@ -56,6 +57,7 @@ def test_rejects_files(tmp_path: Path, names: tuple[str, ...], problem: str) -> 
         map_readers.open_maps([tmp_path / name for name in names])
 
 
+@needs("maps")
 def test_rejects_truncated_file_in_folder_by_name(tmp_path: Path, run_egvs) -> None:
     """Also if it is not needed: what it would add is unknown."""
     (tmp_path / "maps").mkdir()
@@ -80,6 +82,7 @@ def test_rejects_unreadable_file_in_folder_by_name(tmp_path: Path, monkeypatch: 
         map_readers.list_files([tmp_path])
 
 
+@needs("maps")
 def test_surface_model_has_heights(tmp_path: Path) -> None:
     (tmp_path / "surface.asc").write_text("ncols 2")
     (file,) = map_readers.open_surface([tmp_path / "surface.asc"])
@@ -102,6 +105,7 @@ def test_network_made_from_openstreetmap_is_a_network(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("faces", "reader"), [(0, "point cloud"), (1, "triangle mesh")])
+@needs("maps")
 def test_ply_is_a_mesh_if_it_has_faces(tmp_path: Path, faces: int, reader: str) -> None:
     path = tmp_path / "a.ply"
     path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nelement face %d\nend_header\n" % faces)

@@ -28,6 +28,7 @@ from egvs.scenario import loading
 from egvs.sensors import sites
 from egvs.world.terrain import TerrainSurface
 from tests.creation.new_scenarios import create_scenario
+from tests.installed import needs
 from tests.traffic.helpers import netgenerate
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -280,6 +281,7 @@ def write_terrain(path: Path, rise_east: float) -> Path:
     return path
 
 
+@needs("maps")
 def test_roads_buildings_and_sites_follow_a_terrain(tmp_path: Path) -> None:
     """On a plane that rises by 4 % to the east, heights differ by 4 % of the differences of x."""
     small = Path(__file__).parent / "data" / "small.osm"
@@ -343,6 +345,7 @@ def test_network_that_sumo_rejects_is_named(tmp_path: Path, run_egvs) -> None:
 
 
 @pytest.mark.system
+@needs("maps")
 def test_maps_that_cover_all_kerbs_are_named(tmp_path: Path) -> None:
     ring = [[9.99, 51.99], [10.01, 51.99], [10.01, 52.01], [9.99, 52.01], [9.99, 51.99]]
     outline = {"type": "Feature", "properties": {"height": 9}, "geometry": {"type": "Polygon", "coordinates": [ring]}}

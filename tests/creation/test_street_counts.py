@@ -16,6 +16,7 @@ from egvs.creation.street_counts import StreetCounts
 from egvs.formats import osm
 from egvs.scenario import loading
 from tests.creation.overpass_server import SMALL
+from tests.installed import needs
 
 FROM_NORTH, FROM_SOUTH, FROM_EAST, FROM_WEST = "-1002#1", "1002#0", "-1001#1", "1001#0"
 TO_NORTH, TO_SOUTH, TO_EAST, TO_WEST = "1002#1", "-1002#0", "1001#1", "-1001#0"
@@ -237,7 +238,7 @@ def test_other_encoding_is_named(read: Read) -> None:
     [
         (["--traffic", "light"], "--traffic: has no effect on counted traffic"),
         (["--vehicles-per-hour", "9"], "--vehicles-per-hour: has no effect on counted traffic"),
-        (["--like", "tracks.csv"], "--counts: cannot be combined with --like"),
+        pytest.param(["--like", "tracks.csv"], "--counts: cannot be combined with --like", marks=needs("tracks")),
         ([], "missing.csv: cannot be read"),
     ],
 )

@@ -8,7 +8,6 @@ from __future__ import annotations
 import gzip
 import json
 import struct
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,7 @@ import egvs
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.reading import read_json
-from egvs.extensions.hardware.fit.sweep_files import read_sweeps
-from egvs.extensions.tracks.formats.arrow_tables import ArrowTable
-from egvs.formats import arrow_files, pcd, vector_files, xml
+from egvs.formats import pcd, vector_files, xml
 from egvs.sensors import sites
 
 pytestmark = pytest.mark.system
@@ -78,31 +75,6 @@ def test_geoparquet_has_the_limit_of_geojson(tmp_path: Path, monkeypatch: pytest
         vector_files.read_gis_file(path, "Polygon")
     monkeypatch.setenv(limits.DOCUMENT.name, "50")
     assert len(vector_files.read_gis_file(path, "Polygon")["features"]) == 200_000
-
-
-def test_feather_has_a_limit_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "annotations.feather"
-    table = pa.table({"a": pa.array(np.zeros(120_000_000, np.int8))})
-    with pa.ipc.new_file(path, table.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as file:
-        file.write_table(table)
-    assert path.stat().st_size < 1_000_000
-    with pytest.raises(InputError, match=r"annotations\.feather: has 120,000,000 rows"):
-        ArrowTable(path, (), ("a",))
-    monkeypatch.setenv(limits.READER_MEMORY.name, "400")
-    with pytest.raises(InputError, match=r"annotations\.feather: .*(memory|malloc|alloc)"):
-        list(arrow_files.read_batches(path, "cannot be read", ["a"]))
-
-
-def test_npz_has_a_limit_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "bomb.npz"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w") as file:
-        shape = {"descr": "<f8", "fortran_order": False, "shape": (1_000_000, 3)}
-        np.lib.format.write_array_header_1_0(file, shape)
-        file.write(bytes(24_000_000))
-    assert path.stat().st_size < 50_000
-    monkeypatch.setenv(limits.UNPACKED.name, "20")
-    with pytest.raises(InputError, match=r"bomb\.npz: has 24 MB after decompression\. The limit is 20 MB"):
-        read_sweeps([path])
 
 
 def test_xml_has_a_limit_of_elements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

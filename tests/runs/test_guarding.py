@@ -67,7 +67,9 @@ INPUTS = {
 }
 
 
-@pytest.mark.parametrize("verb", ["run", "statics", "report", "accuracy", "validate"])
+@pytest.mark.parametrize(
+    "verb", ["run", "statics", "report", "accuracy", pytest.param("validate", marks=needs("validation"))]
+)
 @pytest.mark.parametrize(("put", "message"), INPUTS.values(), ids=INPUTS.keys())
 def test_run_does_not_overwrite_input(mini: Path, run_egvs, put, message: str, verb: str) -> None:
     put(mini)

@@ -24,8 +24,9 @@ from egvs.scenario.model import Scenario
 from egvs.stages.inputs import Inputs
 from egvs.studies import what_if
 from tests.conftest import SCENARIO, SITES, collection, feature, write_mini
+from tests.installed import needs
 
-pytestmark = pytest.mark.system  # the version of SUMO is part of a stage key
+pytestmark = [pytest.mark.system, needs("tracks")]  # the version of SUMO is part of a stage key
 
 EXCEPTIONS = {
     "extends": "cannot be set on the command line; tests/scenario/test_loading.py shows what it takes over",

@@ -13,6 +13,7 @@ from egvs.runs import stage_keys
 from egvs.scenario.loading import load
 from egvs.stages import check
 from egvs.traffic import traffic_sources
+from tests.installed import needs
 
 TRACKS = 'tracks = ["tracks.csv"]'
 MESSAGE = "needs the extension tracks"
@@ -77,6 +78,7 @@ def test_new_refuses_recordings_without_the_extension(tmp_path: Path, run_egvs, 
     assert not (tmp_path / "new").exists()
 
 
+@needs("tracks")
 def test_help_hides_recordings_without_the_extension(run_egvs, request: pytest.FixtureRequest) -> None:
     options = ("--tracks", "--like", "--pedestrian-tracks", "--signals", "--track-columns", "--track-crs")
     shown = run_egvs("new", "--help")[1]

@@ -144,7 +144,8 @@ class RunRecord:
     stages
         The completed stages, in the order of execution.
     overrides
-        The settings in which ``scenario`` differed from the scenario file, by full key.
+        The settings in which ``scenario`` differed from the scenario file, by full key. Empty for the scenario as it
+        was written, and for a record of an older version.
     """
 
     egvs: str
@@ -179,6 +180,8 @@ class RunRecord:
         if has_checksum and not has_valid_checksum(value):
             raise InputError(path, f"was changed after the run: {CHECKSUM_KEY} does not match the content", _RERUN_HINT)
 
+        if isinstance(value, dict):
+            value = {"overrides": {}, **value}  # which older versions did not record
         for key, expected_type in _RECORD_TYPES.items():
             actual = value.get(key) if isinstance(value, dict) else value
             if not isinstance(actual, expected_type):
