@@ -62,7 +62,7 @@ def test_full_streams_are_reported_and_closed_ones_are_not() -> None:
     assert (full.returncode, full.stderr.split(" (")[0]) == (1, told)
     short = shell("egvs --help > /dev/full")
     assert (short.returncode, len(short.stderr.splitlines())) == (1, 1), short.stderr
-    unread = shell("egvs scores | true")
+    unread = shell("egvs effects | true")
     assert (unread.returncode in (0, 1), unread.stderr) == (True, "")
 
 

@@ -357,6 +357,7 @@ def test_maps_that_cover_all_kerbs_are_named(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.system
+@needs("maps")
 def test_slope_surface_model_and_mesh_in_one_scenario(tmp_path: Path, run_egvs) -> None:
     """On a plane that rises by 5 % to the north; the surface model is 12 m higher, and 3 m on the northern house."""
     made = tmp_path / "made"

@@ -15,6 +15,7 @@ import pytest
 from egvs.cli.commands import GROUP
 from egvs.core import plugins
 from tests.conftest import write_mini
+from tests.installed import needs
 from tests.processes import run_egvs
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -89,6 +90,7 @@ def page(report: Path, browser: Any, request: pytest.FixtureRequest) -> Iterator
     opened.close()
 
 
+@needs("validation")
 def test_report_has_every_section_with_the_map_before_the_tables(page: Any) -> None:
     assert page.locator("h2").all_inner_texts() == ["Before you trust this ranking", *SECTIONS]
     tops = page.evaluate("['svg', 'table'].map(e => document.querySelector(e).getBoundingClientRect().top)")

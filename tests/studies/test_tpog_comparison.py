@@ -17,6 +17,7 @@ from egvs.studies.lane_bins import BIN_M, lane_bins, lane_distances
 from egvs.studies.tpog_comparison import Measured, compare_tpogs, measure
 from egvs.traffic.network import read_net_xml
 from tests.conftest import write_mini
+from tests.installed import needs
 
 NETWORK = """<net version="1.20">
     <location netOffset="0.00,0.00" convBoundary="-20,-2,60,2" origBoundary="0,0,0,0" projParameter="!"/>
@@ -146,6 +147,7 @@ def test_car_that_stands_is_told_from_one_that_drives(run_egvs, tmp_path: Path) 
 
 
 @pytest.mark.slow
+@needs("tracks")
 def test_only_what_the_recording_covered_counts(run_egvs, tmp_path: Path) -> None:
     """The recorded cars drive in the western half of the region, and the recording saw no more."""
     simulated = make_run(tmp_path / "simulated")
