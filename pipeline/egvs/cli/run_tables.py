@@ -51,12 +51,13 @@ _EXTRA_COLUMNS_WIDTH = 130
 
 
 def print_costs(folder: Path, record: RunRecord) -> None:
-    """Print the artefacts of each stage, and what they cost."""
+    """Print the artefacts of each stage, and what they cost, from the rounded costs that ``run.json`` has."""
+    costs = {name: stage.cost.to_json() for name, stage in record.stages.items()}
     columns = [
         Column[str]("stage", str, "left"),
         Column[str]("artefact", lambda stage: "\n".join(_artefact_paths(folder, record, stage)), "left", wrap=True),
-        Column[str]("seconds", lambda stage: f"{record.stages[stage].cost.seconds:.2f}"),
-        Column[str]("peak MB", lambda stage: f"{record.stages[stage].cost.peak_mb:.0f}"),
+        Column[str]("seconds", lambda stage: f"{costs[stage]['seconds']:.2f}"),
+        Column[str]("peak MB", lambda stage: f"{costs[stage]['peak_mb']:.0f}"),
     ]
     console(_RESULT_FILE_WIDTH).print(make_table(columns, record.stages))
 
