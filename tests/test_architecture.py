@@ -63,7 +63,7 @@ def test_no_import_by_string() -> None:
 def test_parquet_and_schemas_are_read_in_one_place() -> None:
     readers = {name for name in MODULES if "pyarrow.parquet" in imported_names(name)}
     # files of other programs
-    foreign = {"formats/arrow_files.py"}
+    foreign = {"formats/parquet_process.py", "traffic/fcd.py", "extensions/tracks/formats/arrow_tables.py"}
     assert readers <= {"artefacts/parquet.py", "artefacts/origin.py", *foreign}
     named = {
         name

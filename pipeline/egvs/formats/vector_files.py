@@ -1,7 +1,7 @@
 """Layers of GIS files as GeoJSON documents: GeoPackage, Shapefile, KML and GeoParquet.
 
 GeoPackage, Shapefile and KML are read by GDAL in a process of its own (:mod:`egvs.formats.gdal_layers`, extra ``gis``),
-GeoParquet (https://geoparquet.org) by pyarrow in another one (:mod:`egvs.formats.arrow_files`). The result is a
+GeoParquet (https://geoparquet.org) by pyarrow in another one (:mod:`egvs.formats.parquet_process`). The result is a
 FeatureCollection with the member ``crs``, as GeoJSON files of this program have it. So the same rules apply to all
 formats. Coordinates stay in the system of the file, x before y.
 
@@ -27,7 +27,7 @@ from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE
-from egvs.formats import arrow_files
+from egvs.formats import parquet_process
 from egvs.formats.gdal_layers import FEATURE_BYTES, read_layer
 
 GIS_FORMATS = {
@@ -128,7 +128,7 @@ def _check_shapefile_complete(path: Path) -> None:
 def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
     """Return the table of a GeoParquet file, the name of its geometry column, and its reference system."""
     doing = "the file cannot be read as GeoParquet"
-    header = arrow_files.read_header(path, doing)
+    header = parquet_process.read_header(path, doing)
     try:
         geo = json.loads(header.metadata["geo"])
         name = geo["primary_column"]
@@ -152,8 +152,8 @@ def _bounded_table(path: Path, doing: str, columns: list[str]) -> pa.Table:
     """Return columns of a file that is small enough to be held as features."""
     batches = []
     size = 0
-    for batch in arrow_files.read_batches(path, doing, columns):
-        size += arrow_files.decoded_bytes(batch) + FEATURE_BYTES * batch.num_rows
+    for batch in parquet_process.read_batches(path, doing, columns):
+        size += parquet_process.decoded_bytes(batch) + FEATURE_BYTES * batch.num_rows
         limits.DOCUMENT.check_bytes(path, size, f"has more than {limits.DOCUMENT.maximum} MB as GeoJSON")
         batches.append(batch)
     if not batches:

@@ -13,6 +13,7 @@ complete. At the end, it checks that the file has all frames.
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -23,10 +24,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from egvs.core import files, limits, reading
+from egvs.core import limits, reading
 from egvs.core.errors import InputError
 from egvs.core.wording import number_of
-from egvs.formats import arrow_files, xml
+from egvs.formats import xml
 from egvs.formats.georeference import WGS84, WORLD, CoordinateReading, Georeference, look_like_degrees
 from egvs.scenario.fields import MAX_COORDINATE_M
 
@@ -41,7 +42,6 @@ _OPTIONAL_DEFAULTS = {"z": 0.0, "slope": 0.0, "speed": float("nan")}
 _STRINGS = ("id", "type")
 _MAY_BE_NAN = ("speed",)
 
-_NO_PARQUET = "cannot be read as Parquet"
 _COMPLETE_FILE = "Use a complete file; create it again."
 _OTHER_PREFIXES = {"vehicle": ("person_", "container_"), "person": ("vehicle_", "container_", "person_slope")}
 """Prefixes of columns to ignore. A person's slope is meaningless: SUMO writes the lane's, in either direction."""
@@ -50,7 +50,6 @@ _BLOCK_BYTES = 1 << 20
 """Arrow reads dozens of blocks ahead: with 4 MiB they take 150 MB, and reading is no faster."""
 
 _BATCH_ROWS = 1 << 16
-_MAX_TEXT = 1000
 _MAX_ROWS_PER_BYTE = 10
 """Positions and angles that change take at least a bit per row."""
 
@@ -173,50 +172,56 @@ def _read_csv(path: Path, element: str) -> Iterator[pa.RecordBatch]:
 
 
 def _read_parquet(path: Path, element: str) -> Iterator[pa.RecordBatch]:
-    with _unzipped(path) as plain:
-        header = arrow_files.read_header(plain, _NO_PARQUET, str(path))
-        columns = _source_columns(list(header.columns), path, element)
-        if header.rows is not None and header.rows > _MAX_ROWS_PER_BYTE * (header.packed_bytes or 0):
-            raise InputError(path, f"declares {header.rows:,} rows in {header.packed_bytes:,} bytes", _COMPLETE_FILE)
-        texts = [columns[name] for name in _STRINGS]
-        for batch in arrow_files.read_batches(plain, _NO_PARQUET, list(columns.values()), texts, str(path)):
-            yield _decode_texts(batch, path).rename_columns(list(columns))
-
-
-def _decode_texts(batch: pa.RecordBatch, path: Path) -> pa.RecordBatch:
-    """Return a batch in which texts are no longer encoded as dictionaries; InputError for a text that is too long."""
-    arrays = []
-    for array in batch.columns:
-        if pa.types.is_dictionary(array.type):
-            longest = max((len(text) for text in array.dictionary.to_pylist() if text is not None), default=0)
-            if longest > _MAX_TEXT:
-                problem = f"expected texts of at most {_MAX_TEXT:,} characters, got one of {longest:,}"
-                raise InputError(path, problem, _COMPLETE_FILE)
-            array = array.dictionary_decode()
-        arrays.append(array)
-    return pa.record_batch(arrays, batch.schema.names)
+    with _open_parquet(path) as file:
+        columns = _source_columns(file.schema_arrow.names, path, element)
+        _check_rows(file.metadata, path)
+        for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
+            batch.validate(full=True)  # texts must be UTF-8
+            yield batch.select(list(columns.values())).rename_columns(list(columns))
 
 
 @contextmanager
-def _unzipped(path: Path) -> Iterator[Path]:
+def _open_parquet(path: Path) -> Iterator[Any]:
+    import pyarrow.parquet as pq
+
+    with (
+        reading.translate_errors(path, _COMPLETE_FILE, "cannot be read as Parquet"),
+        _open_seekable(path) as source,
+        pq.ParquetFile(source) as file,
+    ):
+        yield file
+
+
+@contextmanager
+def _open_seekable(path: Path) -> Iterator[Any]:
     """Unzip a gzipped file first, since Parquet is read from its end."""
-    if not xml.is_gzip(path):
+    if xml.is_gzip(path):
+        with xml.open_bounded(path) as file, tempfile.TemporaryFile() as plain:
+            shutil.copyfileobj(file, plain)
+            plain.seek(0)
+            yield plain
+    else:
         yield path
-        return
-    with files.temporary_folder() as folder:
-        plain = folder / "fcd.parquet"
-        with xml.open_bounded(path) as file, plain.open("wb") as copy:
-            shutil.copyfileobj(file, copy)
-        yield plain
 
 
-def fcd_metadata(path: Path) -> str | None:
+def fcd_metadata(path: Path) -> bytes | None:
     """Return the metadata of a Parquet file under the key ``egvs``; None without such a key, and for other formats."""
     with xml.open_bounded(path) as file:
-        if not file.read(4).startswith(arrow_files.PARQUET_START):
+        if not file.read(4).startswith(b"PAR1"):
             return None
-    with _unzipped(path) as plain:
-        return arrow_files.read_header(plain, _NO_PARQUET, str(path)).metadata.get("egvs")
+    with _open_parquet(path) as parquet:
+        values: dict[bytes, bytes] = parquet.metadata.metadata or {}
+        return values.get(b"egvs")
+
+
+def _check_rows(metadata: Any, path: Path) -> None:
+    """Raise an InputError if a Parquet file declares more rows than it can contain."""
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    largest = max((group.total_byte_size for group in groups), default=0)
+    limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB after decompression")
+    packed = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
+    if metadata.num_rows > _MAX_ROWS_PER_BYTE * packed:
+        raise InputError(path, f"declares {metadata.num_rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)
 
 
 def _read_xml(path: Path, element: str) -> Iterator[pa.RecordBatch]:

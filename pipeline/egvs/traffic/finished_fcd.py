@@ -81,7 +81,7 @@ def read_fcd_metadata(path: Path) -> FcdMetadata | None:
         return None
     hint = "Use the original file, or create it again."
     try:
-        values: Any = reading.parse_json(raw.encode())
+        values: Any = reading.parse_json(raw)
     except (ValueError, RecursionError) as error:
         raise InputError(path, f"its metadata is not valid JSON ({error})", hint) from None
     if not isinstance(values, dict) or _MARKER_KEY not in values:

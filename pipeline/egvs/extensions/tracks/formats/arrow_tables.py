@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,23 +11,29 @@ import numpy as np
 from egvs.core import limits, reading
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.formats import arrow_files
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_DOING = "cannot be read as Parquet or Feather"
+_PARQUET, _FEATHER = b"PAR1", b"ARROW1"
 _HINT = "Use the file as it was published."
 
 
 def column_names(path: Path, head: bytes) -> set[str]:
     """Return the columns of a Parquet or Feather file; none if it is another file or damaged."""
-    if not head.startswith((arrow_files.PARQUET_START, arrow_files.FEATHER_START)):
-        return set()
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     try:
-        return set(arrow_files.read_header(path, _DOING).columns)
+        with reading.translate_errors(path):
+            if head.startswith(_PARQUET):
+                return set(pq.read_schema(path).names)
+            if head.startswith(_FEATHER):
+                with pa.OSFile(str(path)) as file:
+                    return set(pa.ipc.open_file(file).schema.names)
     except InputError:
-        return set()
+        pass
+    return set()
 
 
 class ArrowTable:
@@ -54,19 +60,15 @@ class ArrowTable:
         import pyarrow as pa
 
         self.path = path
-        header = arrow_files.read_header(path, _DOING)
-        limits.ROWS.check(path, header.rows or 0)
-        selected = _select(path, header.columns, [*texts, *numbers], optional)
-        batches = []
-        rows = size = 0
-        for batch in arrow_files.read_batches(path, _DOING, selected, [name for name in texts if name in selected]):
-            rows, size = rows + batch.num_rows, size + batch.nbytes
-            limits.ROWS.check(path, rows)
-            limits.UNPACKED.check_bytes(path, size)
-            batches.append(batch)
-        if not batches:
-            raise InputError(path, "contains no rows", _HINT)
-        self._table = pa.Table.from_batches(batches)
+        limits.checked_size(path, limits.FILE)
+        with reading.translate_errors(path, _HINT, "cannot be read as Parquet or Feather"):
+            with path.open("rb") as file:
+                is_parquet = file.read(len(_PARQUET)) == _PARQUET
+            read_batches = _parquet_batches if is_parquet else _feather_batches
+            batches = list(read_batches(path, texts, [*texts, *numbers], optional))
+            if not batches:
+                raise InputError(path, "contains no rows", _HINT)
+            self._table = pa.Table.from_batches(batches)
 
     @property
     def n_rows(self) -> int:
@@ -110,6 +112,43 @@ class ArrowTable:
 
     def _error(self, row: int, name: str, problem: str) -> InputError:
         return InputError(f"{self.path}: row {row + 1}: {name}", problem, "Correct the row, or remove it.")
+
+
+def _parquet_batches(
+    path: Path, texts: Sequence[str], names: Sequence[str], optional: Collection[str]
+) -> Iterator[pa.RecordBatch]:
+    import pyarrow.parquet as pq
+
+    # Texts stay encoded: a long one that occurs in each row would otherwise fill the memory.
+    with pq.ParquetFile(path, read_dictionary=list(texts)) as file:
+        selected = _select(path, file.schema_arrow.names, names, optional)
+        limits.ROWS.check(path, file.metadata.num_rows)
+        groups = (file.metadata.row_group(index) for index in range(file.metadata.num_row_groups))
+        limits.UNPACKED.check_bytes(path, sum(group.total_byte_size for group in groups))
+        for batch in file.iter_batches(columns=selected, use_threads=False):
+            batch.validate(full=True)
+            yield batch
+
+
+def _feather_batches(
+    path: Path, _texts: Sequence[str], names: Sequence[str], optional: Collection[str]
+) -> Iterator[pa.RecordBatch]:
+    import pyarrow as pa
+
+    with pa.OSFile(str(path)) as source:
+        with pa.ipc.open_file(source) as file:
+            actual = file.schema.names
+        selected = _select(path, actual, names, optional)
+        options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=[actual.index(name) for name in selected])
+        source.seek(0)
+        file = pa.ipc.open_file(source, options=options)
+        rows = 0
+        for index in range(file.num_record_batches):
+            batch = file.get_batch(index)
+            batch.validate(full=True)
+            rows += batch.num_rows
+            limits.ROWS.check(path, rows)
+            yield batch
 
 
 def _select(path: Path, actual: Sequence[str], names: Sequence[str], optional: Collection[str]) -> list[str]:
