@@ -85,7 +85,6 @@ def test_run_imports_only_declarations_of_extensions(tmp_path: Path) -> None:
     code = """
 import sys
 from egvs.cli.app import app
-from tests.installed import EXTENSIONS, needs
 for _ in range(2):
     try:
         app(["run", "demo", "--out", "out", "--set", "traffic.frames=50"])
