@@ -99,7 +99,7 @@ def test_endless_table_of_contents_ends(tmp_path: Path, monkeypatch: pytest.Monk
         vector_files.read_gis_file(path, "Point")
 
 
-def test_layer_beside_a_view_is_read(tmp_path: Path) -> None:
+def test_reads_layer_in_file_with_a_view(tmp_path: Path) -> None:
     path = points(tmp_path / "poles.gpkg")
     run_sql(
         path,

@@ -25,7 +25,7 @@ from egvs.sensors import sites
 pytestmark = pytest.mark.system
 
 
-def test_late_duplicate_key_of_many_is_found(tmp_path: Path) -> None:
+def test_rejects_late_duplicate_of_many_keys(tmp_path: Path) -> None:
     """One look at each key: with a count of all names for each name, this takes an hour."""
     path = tmp_path / "a.json"
     keys = [f'"{number}": 0' for number in range(400_000)]

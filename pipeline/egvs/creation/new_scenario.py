@@ -415,7 +415,7 @@ def create_scenario(
     _collect_objects(draft)
     _choose_region(draft)
     _choose_poles(draft)
-    _note_doubts(draft)
+    _add_notes(draft)
     _plan_traffic(draft)
     return _write_scenario(draft)
 
@@ -517,7 +517,7 @@ def _choose_poles(draft: _Draft) -> None:
         raise _no_pole_error(draft.junction, draft.options, draft.files.roads.path, covering)
 
 
-def _note_doubts(draft: _Draft) -> None:
+def _add_notes(draft: _Draft) -> None:
     """Note what to know about the junction and its static objects before trusting the scenario."""
     counts, junction = draft.objects.counts, draft.junction
     draft.notes += _surface_notes(draft.surface, counts)
