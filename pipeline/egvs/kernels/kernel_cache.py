@@ -12,6 +12,7 @@ is compiled again.
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import pickle
 import sys
@@ -20,6 +21,7 @@ from typing import Any
 
 import numba
 from numba.core.caching import FunctionCache
+from numba.core.environment import Environment, lookup_environment
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
@@ -27,10 +29,7 @@ from egvs.core.cache_folder import find_cache_folder, read_checked, write_checke
 
 
 class CheckedCache(FunctionCache):
-    """The compiled versions of one function: a file for each signature and processor, each after its hash.
-
-    It builds on internal parts of numba's cache, because numba has no public way to check a file before it is loaded.
-    """
+    """The compiled versions of one function: a file for each signature and processor, each after its hash."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the compiled code of a signature, or None where there is no intact file.
@@ -44,7 +43,7 @@ class CheckedCache(FunctionCache):
         content = read_checked(self._file(key))
         if content is None:
             return None
-        stored_key, payload = pickle.loads(content)
+        stored_key, payload = _KernelUnpickler(io.BytesIO(content)).load()
         if stored_key != key:
             return None
         return self._impl.rebuild(target_context, payload)
@@ -59,6 +58,31 @@ class CheckedCache(FunctionCache):
     def _file(self, key: Any) -> Path:
         name = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
         return Path(self.cache_path) / f"{self._impl.filename_base}.{name}.kernel"
+
+
+class _KernelUnpickler(pickle.Unpickler):
+    """Reads compiled code without importing the modules of numba and scipy that it was compiled with."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return a class or function by name."""
+        if (module, name) == ("numba.core.environment", "_rebuild_env"):
+            return _rebuild_environment
+        return super().find_class(module, name)
+
+
+def _rebuild_environment(module: str, constants: list[Any], name: str) -> Any:
+    """Return the environment of a compiled function, as numba does, but without importing its module.
+
+    Compiled code of ``nopython`` functions reads the constants; the variables of the module are for other functions.
+    """
+    environment = lookup_environment(name)
+    if environment is None:
+        variables = sys.modules[module].__dict__ if module in sys.modules else {"__name__": module}
+        environment = Environment(variables)
+        environment.consts[:] = constants
+        environment.env_name = name
+        Environment._memo[name] = environment
+    return environment
 
 
 def use_cache_folder(kernels: Path) -> bool:
