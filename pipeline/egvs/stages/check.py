@@ -28,6 +28,7 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     scene_checks.check_period_networks,
     traffic_checks.check_times,
     traffic_checks.check_sumo_files,
+    traffic_checks.check_sumo_locations,
     traffic_checks.check_period_weights,
     traffic_checks.check_demand,
     traffic_checks.check_signals,

@@ -10,6 +10,7 @@ from pathlib import Path
 from egvs.artefacts import tpog
 from egvs.core.errors import Diagnostic, InputError
 from egvs.effects import registry
+from egvs.formats import xml
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import CheckInputs, ErrorCollector
 from egvs.traffic import demand, fcd, finished_fcd, network, recording, sumo_folder, traffic_sources, user_files
@@ -59,6 +60,44 @@ def check_sumo_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         if path.is_file() and not network.is_osm(path):
             errors.attempt("traffic", partial(user_files.check_copyable, path))
     yield from errors.findings
+
+
+@_for_each_period
+def check_sumo_locations(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report additional files of SUMO, and FCD, that state another offset or projection than the network."""
+    scenario = inputs.scenario
+    traffic = scenario.traffic
+    paths: list[Path] = []
+    try:
+        if not traffic.is_finished:
+            paths = list(sumo_folder.demand_files(scenario).files.get("additional-files", ()))
+        elif traffic.fcd is not None and not traffic.fcd_geo:
+            paths = [scenario.find(traffic.fcd, "traffic.fcd")]
+        expected = geolocation.network_location(scenario)
+    except InputError:
+        return  # another rule reports it
+    if expected is None:
+        return
+    errors = ErrorCollector()
+    for path in paths:
+        location = _stated_location(path)
+        if location is not None:
+            stated = geolocation.StatedLocation(str(path), location)
+            errors.attempt(
+                "traffic", partial(stated.check_same, expected, "Make it again with the scenario's network.")
+            )
+    yield from errors.findings
+
+
+def _stated_location(path: Path) -> network.Location | None:
+    """Return the ``<location>`` of an XML file; None for another file, and for one that another rule rejects."""
+    with xml.open_bounded(path) as file:
+        if not file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+            return None
+    try:
+        return network.read_location(path, "")
+    except InputError:
+        return None
 
 
 def check_period_weights(inputs: CheckInputs) -> Iterator[Diagnostic]:

@@ -29,7 +29,7 @@ from egvs.world.extrusion import extrude_polygon
 from egvs.world.footprints import Footprint, read_footprints
 from egvs.world.map_features import SolidTypes
 from egvs.world.mesh import World
-from egvs.world.sumo_polygons import read_poly_xml
+from egvs.world.sumo_polygons import read_poly_location, read_poly_xml
 from egvs.world.terrain import GroundSource, TerrainSurface
 
 Floats = NDArray[np.float64]
@@ -86,7 +86,10 @@ def build_world(
     types = SolidTypes(config.polygon_types)
     files = [read_footprints(scenario.find(name, "statics.footprints"), world) for name in config.footprints]
     polygons = [scenario.find(name, "statics.polygons") for name in config.polygons]
-    files += [read_poly_xml(path, types, config.polygon_height_m, world) for path in polygons]
+    location = geolocation.network_location(scenario)
+    for path in polygons:
+        files.append(read_poly_xml(path, types, config.polygon_height_m, world, location))
+        location = location or read_poly_location(path)
     footprints = []
     for file in files:
         footprints += file.footprints
