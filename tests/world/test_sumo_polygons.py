@@ -441,7 +441,8 @@ def read_beside_network(folder: Path, network: str, *shapes: str, world: Georefe
         (
             stated("0,0"),
             stated("0,0", UTM),
-            f"netOffset 0,0 and projParameter '{UTM}', but that of the network n.net.xml netOffset 0,0 and no projection",
+            f"netOffset 0,0 and projParameter '{UTM}',"
+            " but that of the network n.net.xml netOffset 0,0 and no projection",
         ),
         (stated("5,5", "-"), stated("5,6", "-"), "netOffset 5,6, but that of the network n.net.xml netOffset 5,5"),
     ],
