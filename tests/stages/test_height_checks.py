@@ -11,7 +11,7 @@ import trimesh
 
 from egvs.formats import ply
 from tests.stages.conftest import LANES, net_xml
-from tests.stages.test_check import box, found, sites, statics
+from tests.stages.test_check import SCENARIOS, box, found, sites, statics
 
 
 def house(foot_m: float, height_m: float = 6.0, north_m: float = 8.0, **more: object) -> dict:
@@ -127,6 +127,21 @@ def test_hint_names_the_key_of_the_zero(street: Path, run_egvs) -> None:
     code, _, err = run_egvs("run", street, "--out", street / "run")
     assert code == 2 and "112.0 m above the road" in err
     assert not (street / "run" / "scores.parquet").exists()
+
+
+def test_thin_solids_beside_the_road_float_above_decks(street: Path) -> None:
+    """Garages and walls are as thin as decks, but no deck beside a road is 30 m high."""
+    statics(street, house(30.0, 2.5, name="garage"))
+    (told,) = heights(street)
+    assert "1 of 1 solid near the region has its foot 30.0 m above the road beside it: garage" in told
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    "folder", sorted(path.parent for path in SCENARIOS.glob("*/scenario.toml")), ids=lambda p: p.name
+)
+def test_shipped_scenarios_have_no_finding(folder: Path) -> None:
+    assert heights(folder) == []
 
 
 # --- recorded traffic

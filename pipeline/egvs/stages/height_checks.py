@@ -4,8 +4,8 @@ Heights above sea level beside a road at z = 0 make solids, or vehicles, float w
 compared with those of the road beside them (of the traffic, where there is no network), in z of the world frame:
 
 - A solid floats if its foot is higher above the road than a slope of :data:`MAX_SLOPE` explains and above all sensors,
-  and no other solid carries it. It is buried if its roof is lower below the road than such a slope explains. Thin
-  solids and solids over lanes are decks, roofs and crowns: they float only from :data:`MAX_ELEVATED_M` on.
+  and no other solid carries it. It is buried if its roof is lower below the road than such a slope explains. Solids
+  over lanes, bridges and crowns float only above :data:`MAX_ELEVATED_M`, other thin solids above :data:`MAX_BESIDE_M`.
 - If most solids of a file float or are buried, its zero is another one, which is an error; single ones are a warning.
 - Vehicles are compared with the lanes below them, lanes with the points of the terrain, sensors with the road.
 
@@ -45,7 +45,10 @@ MAX_ELEVATED_M = 40.0
 """Decks, roofs and viaducts are at most this high above a road, or a road above the terrain."""
 
 MAX_DECK_M = 3.0
-"""A solid no thicker than this may be a deck, a roof, a sign or a cable."""
+"""A solid no thicker than this may be a roof, a sign or the deck of a railway beside the road,"""
+
+MAX_BESIDE_M = 20.0
+"""at most this high."""
 
 MAX_SENSOR_M = 20.0
 """Sensors higher than this above the road, without a solid that carries them, get a warning."""
@@ -201,8 +204,8 @@ def _check_source(
     foot_m, roof_m = extents.low_m[solids, 2], extents.high_m[solids, 2]
     above_m = foot_m - high_m
     sensors_m = max((site.pose.z_m for site in inputs.sites), default=-np.inf)
-    is_deck = _may_be_overhead(inputs, extents, solids, boxes)
-    floats = above_m > np.where(is_deck, np.maximum(allowed_m, MAX_ELEVATED_M), allowed_m)
+    overhead_m = _overhead_heights_m(inputs, extents, solids, boxes)
+    floats = above_m > np.maximum(allowed_m, overhead_m)
     floats &= (foot_m > sensors_m) | (above_m > allowed_m + MAX_ELEVATED_M)
     is_carried = extents.carried(solids)
     floats &= ~is_carried
@@ -213,7 +216,7 @@ def _check_source(
             ground_m = _ground_below_m(inputs.world, boxes[number])
             floats[number] &= foot_m[number] > ground_m + MARGIN_M
             is_buried[number] &= roof_m[number] < ground_m
-    judged = ~is_deck & ~is_carried | floats | is_buried
+    judged = (overhead_m == 0) & ~is_carried | floats | is_buried
     names = [inputs.world.solids[solid][0] for solid in solids]
     for is_off, offset_m, part, side in (
         (floats, above_m, "foot", "above"),
@@ -223,16 +226,18 @@ def _check_source(
             yield _solid_diagnostic(source, reference, is_off, judged, offset_m, names, part, side)
 
 
-def _may_be_overhead(
+def _overhead_heights_m(
     inputs: CheckInputs, extents: _Extents, solids: NDArray[np.int64], boxes: NDArray[Any]
-) -> NDArray[np.bool_]:
-    """Return which solids may be decks, roofs, signs or crowns: by kind, thickness, or above a lane."""
+) -> FloatArray:
+    """Return how high solids may be above the road without a slope, as decks, roofs, signs or crowns; 0 for others."""
     assert inputs.world is not None
+    thickness_m = extents.high_m[solids, 2] - extents.low_m[solids, 2]
+    heights_m = np.where(thickness_m <= MAX_DECK_M, MAX_BESIDE_M, 0.0)
     is_overhead = np.array([inputs.world.solids[solid][1].lower() in _OVERHEAD_KINDS for solid in solids], dtype=bool)
-    is_overhead |= extents.high_m[solids, 2] - extents.low_m[solids, 2] <= MAX_DECK_M
     if inputs.carriageway is not None:
         is_overhead[np.unique(inputs.carriageway.touching(boxes)[0])] = True
-    return is_overhead
+    heights_m[is_overhead] = MAX_ELEVATED_M
+    return heights_m
 
 
 def _ground_below_m(world: World, box: Any) -> float:
