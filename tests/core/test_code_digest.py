@@ -165,7 +165,7 @@ def test_library_versions_are_those_installed() -> None:
 
 
 MOST_LINES = {
-    "check": 15_000,
+    "check": 15_400,  # with the comparison of heights
     "statics": 9_500,
     "scan": 11_300,
     "traffic": 9_800,

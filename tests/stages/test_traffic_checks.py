@@ -75,6 +75,51 @@ def test_rejects_files_that_sumo_may_not_read(street: Path, routes: str, additio
     assert found(street).get("traffic", []) == [told]
 
 
+OTHER = '<location netOffset="30.00,0.00" projParameter="!"/>'
+"""Of a file that was made for another network than the street, whose offset is 0,0."""
+
+OTHER_PROBLEM = "its <location> states netOffset 30,0, but that of the network net.net.xml netOffset 0,0"
+
+
+def test_rejects_additional_file_of_other_network(street: Path) -> None:
+    (street / "more.add.xml").write_text(f"<additional>{OTHER}</additional>")
+    configured(street, DEMAND, additional="more.add.xml")
+    simulated(street, 'sumocfg = "own.sumocfg"\n')
+    assert found(street)["traffic"] == [f"more.add.xml: {OTHER_PROBLEM}"]
+    (street / "more.add.xml").write_text(f"<additional>{OTHER.replace('30', '0')}</additional>")
+    assert "traffic" not in found(street)
+
+
+def test_rejects_polygons_of_other_network(street: Path) -> None:
+    shape = '<poly id="a" type="building" fill="1" shape="30,20 34,20 34,24 30,24"/>'
+    (street / "a.poly.xml").write_text(f"<additional>{OTHER}{shape}</additional>")
+    told = found(street, 'statics.polygons=["a.poly.xml"]')
+    assert told["statics"] == [f"a.poly.xml: {OTHER_PROBLEM}"]
+
+
+def test_rejects_polygons_of_two_networks(mini: Path) -> None:
+    """Without a network, the files are compared with each other."""
+    shape = '<poly id="a" type="building" fill="1" shape="30,20 34,20 34,24 30,24"/>'
+    for name, offset in (("a", "0"), ("b", "30")):
+        (mini / f"{name}.poly.xml").write_text(f"<additional>{OTHER.replace('30', offset)}{shape}</additional>")
+    told = found(mini, 'statics.polygons=["a.poly.xml", "b.poly.xml"]')
+    assert told["statics"] == ["b.poly.xml: its <location> states netOffset 30,0, but that of a.poly.xml netOffset 0,0"]
+
+
+def test_rejects_fcd_of_other_network(street: Path) -> None:
+    rows = "".join(
+        f'<timestep time="{second / 2}"><vehicle id="a" x="{second}" y="-1.6" angle="90" type="car"/></timestep>'
+        for second in range(200)
+    )
+    text = (street / "scenario.toml").read_text()
+    text = text.replace('network = "net.net.xml"\n', 'roads = "net.net.xml"\nfcd = "own.xml"\n')
+    (street / "scenario.toml").write_text(text)
+    (street / "own.xml").write_text(f"<fcd-export>{OTHER}{rows}</fcd-export>")
+    assert found(street)["traffic"] == [f"own.xml: {OTHER_PROBLEM}"]
+    (street / "own.xml").write_text(f"<fcd-export>{rows}</fcd-export>")
+    assert "traffic" not in found(street)
+
+
 def test_rejects_period_routes_without_vehicles(street: Path, run_egvs) -> None:
     configured(street, DEMAND, name="day")
     configured(street, "<routes/>", name="night")
@@ -142,10 +187,15 @@ MAPPED = net_xml().replace('projParameter="!"', f'projParameter="{UTM}"').replac
             MAPPED,
             MAPPED.replace("-500000", "-500009"),
             "its network has another origin or projection than that of the first period"
-            " (netOffset [-500009.0, -5600000.0] instead of [-500000.0, -5600000.0])",
+            " (netOffset -500009,-5600000 instead of netOffset -500000,-5600000)",
         ),
         (net_xml(), net_xml().replace("80,", "90,"), None),
-        (net_xml(), net_xml().replace("0.00,0.00", "9.00,0.00"), None),  # made without a map: zeros say nothing
+        (
+            net_xml(),
+            net_xml().replace("0.00,0.00", "9.00,0.00"),
+            "its network has another origin or projection than that of the first period"
+            " (netOffset 9,0 instead of netOffset 0,0)",
+        ),
     ],
 )
 def test_rejects_period_network_elsewhere(street: Path, first: str, other: str, told: str | None) -> None:

@@ -23,7 +23,7 @@ from egvs.scenario.loading import scenario_from_dict
 from egvs.traffic.network import read_location
 from egvs.world import static_world
 from egvs.world.footprints import FootprintFile
-from egvs.world.geolocation import network_world_frame
+from egvs.world.geolocation import StatedLocation, network_world_frame
 from egvs.world.map_features import SolidTypes
 from egvs.world.mesh import World
 from egvs.world.sumo_polygons import read_poly_xml
@@ -417,6 +417,75 @@ def test_converts_from_location_of_file(tmp_path: Path) -> None:
         read(tmp_path, far, poly("building"), world=here)
     with pytest.raises(InputError, match=r"are 141 km from the region of interest"):
         read(tmp_path, poly("building", "100000,100000 100004,100000 100004,100004"))
+
+
+def stated(offset: str, projection: str = "!") -> str:
+    return f'<location netOffset="{offset}" projParameter="{projection}"/>'
+
+
+def read_beside_network(folder: Path, network: str, *shapes: str, world: Georeference = NOWHERE) -> FootprintFile:
+    """Shapes beside a network with a ``<location>``."""
+    (folder / "n.net.xml").write_text(f"<net>{network}</net>")
+    location = read_location(folder / "n.net.xml")
+    assert location is not None
+    path = folder / "s.poly.xml"
+    path.write_text(f"<additional>{''.join(shapes)}</additional>")
+    return read_poly_xml(path, SolidTypes({}), 9.0, world, StatedLocation("the network n.net.xml", location))
+
+
+@pytest.mark.parametrize(
+    ("network", "file", "statements"),
+    [
+        (stated("0.00,0.00"), stated("30.00,0.00"), "netOffset 30,0, but that of the network n.net.xml netOffset 0,0"),
+        (stated("0,0"), stated("0,-0.5", ""), "netOffset 0,-0.5, but that of the network n.net.xml netOffset 0,0"),
+        (
+            stated("0,0"),
+            stated("0,0", UTM),
+            f"netOffset 0,0 and projParameter '{UTM}',"
+            " but that of the network n.net.xml netOffset 0,0 and no projection",
+        ),
+        (stated("5,5", "-"), stated("5,6", "-"), "netOffset 5,6, but that of the network n.net.xml netOffset 5,5"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("is_last", [False, True])
+def test_rejects_other_location_that_cannot_be_converted(
+    tmp_path: Path, network: str, file: str, statements: str, is_last: bool
+) -> None:
+    """Without a projection on both sides, nobody knows whether both offsets count from the same origin."""
+    elements = [poly("building"), file] if is_last else [file, poly("building")]
+    with pytest.raises(InputError) as error:
+        read_beside_network(tmp_path, network, *elements)
+    assert error.value.where == str(tmp_path / "s.poly.xml")
+    assert error.value.problem == f"its <location> states {statements}"
+    assert error.value.hint.startswith("Make the file with polyconvert and the scenario's network (-n).")
+
+
+def test_rejects_points_of_other_location(tmp_path: Path) -> None:
+    lamp = '<poi id="a" type="highway.street_lamp" x="2" y="2"/>'
+    assert len(read_beside_network(tmp_path, stated("0,0"), stated("0,0"), lamp).footprints) == 1
+    with pytest.raises(InputError, match="states netOffset 30,0"):
+        read_beside_network(tmp_path, stated("0,0"), stated("30,0"), lamp)
+
+
+def test_accepts_same_location_in_other_notation(tmp_path: Path) -> None:
+    file = read_beside_network(tmp_path, stated("0.00,-0.001", ""), stated("0,0"), poly("building"))
+    assert file.footprints[0].polygon.bounds == (0, 0, 4, 4)
+    assert not file.repaired["shapes in metres of its own <location>, brought into the world frame"]
+
+
+def test_counts_shapes_that_are_converted(tmp_path: Path) -> None:
+    here = Georeference(FRAME, HERE, "scenario.toml")
+    moved = stated("-550690.00,-5635195.00", UTM)
+    file = read_beside_network(
+        tmp_path, stated("-550700.00,-5635200.00", UTM), moved, poly("building", "10,5 14,5 14,9 10,9"), world=here
+    )
+    assert file.footprints[0].polygon.bounds == (0, 0, 4, 4)
+    assert file.repaired["shapes in metres of its own <location>, brought into the world frame"] == 1
+
+
+def test_rejects_two_locations(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there are two <location>s"):
+        read(tmp_path, stated("0,0"), poly("building"), stated("30,0"))
 
 
 # ---- a file that polyconvert made

@@ -28,7 +28,11 @@ from egvs.drawing import colours
 from egvs.drawing.basemap import network_file, union_of_triangles
 from egvs.export.finished_run import FinishedRun
 from egvs.sensors.sensor import scenario_sensor
+from egvs.sensors.site_feasibility import ground_height_m
+from egvs.sensors.sites import Pose
 from egvs.traffic import network
+from egvs.world.footprints import WORLD_DATUM, Z_DATUM
+from egvs.world.mesh import World
 
 JUNCTIONS, SITES, PLAN, MISSED, MISSED_LANES, FOOTPRINTS, REGION = NAMES = (
     "junctions", "sites", "plan", "blindspots", "blindspot_lanes", "footprints", "region",
@@ -58,6 +62,8 @@ class Layer:
         Whether small values of that column are dark.
     initial_site
         The site whose rows a map shows at first, in a layer with rows of every site; empty otherwise.
+    ground_m
+        z of the ground below each point, shape (n,), world frame; None for a ground at z = 0.
     """
 
     name: str
@@ -66,6 +72,7 @@ class Layer:
     colours_by: str = ""
     emphasises_low: bool = False
     initial_site: str = ""
+    ground_m: NDArray[np.float64] | None = None
 
     @property
     def has_points(self) -> bool:
@@ -105,7 +112,7 @@ def kml_layers(run: FinishedRun, layers: Sequence[Layer], notes: list[str]) -> l
     """Return what a KML file shows of the layers of a run, so that it stays small enough for phones and maps online.
 
     Of the footprints, those within the range of a sensor; of the blind spots, those of the best candidates on the best
-    poles. Notes say what is left out.
+    poles. Notes say what is left out. Sensors get the ground below them, since altitudes count from it.
     """
     scores = parquet.read_artefact(run.artefact(RunFolder.scores.name), "scores")[0]
     best = pa.array(_best_on_poles(scores)[:MAX_KML_POLES])
@@ -120,6 +127,9 @@ def kml_layers(run: FinishedRun, layers: Sequence[Layer], notes: list[str]) -> l
         if not kept.all():
             counts = f"{kept.sum():,} of {len(kept):,}"
             notes.append(f"{layer.name}: {counts}, {_KML_REASONS[layer.name]}; GeoPackage and GeoJSON files have all")
+        if layer.name in (SITES, PLAN):
+            run.artefact(RunFolder.statics.name)
+            layer = replace(layer, ground_m=ground_heights_m(run.work.world, layer.rows))
         if kept.any():
             shown.append(replace(layer, geometries=layer.geometries[kept], rows=layer.rows.filter(pa.array(kept))))
     return shown
@@ -129,6 +139,12 @@ _BEST_ON_POLES = f"those of the best candidate on each of the best {MAX_KML_POLE
 _KML_REASONS = {
     FOOTPRINTS: "those within the range of a sensor", MISSED: _BEST_ON_POLES, MISSED_LANES: _BEST_ON_POLES,
 }  # fmt: skip
+
+
+def ground_heights_m(world: World, rows: pa.Table) -> NDArray[np.float64]:
+    """Return z of the ground below the points in the columns x_m and y_m of a table, shape (n,)."""
+    points = zip(rows.column("x_m").to_pylist(), rows.column("y_m").to_pylist(), strict=True)
+    return np.array([ground_height_m(world, Pose(x_m, y_m, 0.0)) for x_m, y_m in points], dtype=np.float64)
 
 
 def _best_on_poles(scores: pa.Table) -> list[str]:
@@ -247,7 +263,8 @@ def _footprint_layers(run: FinishedRun) -> Iterator[Layer]:
         if not parts:
             continue
         z_m = corners[:, :, 2]
-        rows.append({"name": name, "kind": kind, "base_m": float(z_m.min()), "height_m": float(z_m.max())})
+        heights = {"base_m": float(z_m.min()), "height_m": float(z_m.max()), Z_DATUM: WORLD_DATUM}
+        rows.append({"name": name, "kind": kind, **heights})
         shapes.append(shapely.MultiPolygon(parts))
     if rows:
         yield Layer(FOOTPRINTS, np.array(shapes, dtype=object), pa.Table.from_pylist(rows))

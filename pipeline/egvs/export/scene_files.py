@@ -34,6 +34,7 @@ from egvs.export.extrinsics import (
     transform_world_sensor,
 )
 from egvs.export.finished_run import ExportCrs, FinishedRun
+from egvs.formats.meshes import SCENE_NODE
 from egvs.results.ranking import RankedSite
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 GLTF_FILE, USD_FILE, EXTRINSICS_FILE = "scene.glb", "scene.usdc", "extrinsics.json"
-WORLD_NODE = "egvs_world_z_up"
+WORLD_NODE = SCENE_NODE
 
 MAX_FLOAT32_M = 8192.0
 """Below this distance from the origin, float32 resolves 0.5 mm."""

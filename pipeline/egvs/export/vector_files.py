@@ -117,6 +117,8 @@ _ALPHA = {FOOTPRINTS: "a0", REGION: "00"}
 def write_kml(path: Path, name: str, layers: Sequence[Layer], reference: ExportCrs) -> None:
     """Write a document with one folder per layer, and in it one per site if the layer has rows of each site.
 
+    Points have their height above the ground as altitude, and z of the world frame in the field ``z_m``.
+
     Parameters
     ----------
     path
@@ -135,7 +137,11 @@ def write_kml(path: Path, name: str, layers: Sequence[Layer], reference: ExportC
     for layer in layers:
         layer_folder = _folder(document, layer.name)
         site_folders: dict[str, ET.Element] = {}
-        for row, shape in zip(layer.rows.to_pylist(), reference.geometries(layer.geometries), strict=True):
+        shapes = reference.geometries(layer.geometries)
+        for number, (row, shape) in enumerate(zip(layer.rows.to_pylist(), shapes, strict=True)):
+            altitude_m = row.get("z_m") if layer.has_points else None
+            if altitude_m is not None and layer.ground_m is not None:
+                altitude_m = round(altitude_m - float(layer.ground_m[number]), 6)
             folder, is_visible = layer_folder, True
             if layer.initial_site:
                 site = row["site"]
@@ -146,7 +152,7 @@ def write_kml(path: Path, name: str, layers: Sequence[Layer], reference: ExportC
             style = f"{layer.name}-{colour}"
             if style not in styles:
                 styles[style] = _style(style, layer, colour)
-            _placemark(folder, layer, row, shape, style, is_visible)
+            _placemark(folder, layer, row, shape, style, is_visible, altitude_m)
     for number, element in enumerate(styles.values(), start=1):
         document.insert(number, element)
     ET.indent(root, space="")  # one element per line; spaces would be a third of the file
@@ -160,7 +166,13 @@ def _folder(parent: ET.Element, name: str) -> ET.Element:
 
 
 def _placemark(
-    folder: ET.Element, layer: Layer, row: Mapping[str, Any], shape: Any, style: str, is_visible: bool
+    folder: ET.Element,
+    layer: Layer,
+    row: Mapping[str, Any],
+    shape: Any,
+    style: str,
+    is_visible: bool,
+    altitude_m: float | None,
 ) -> None:
     mark = ET.SubElement(folder, "Placemark")
     ET.SubElement(mark, "name").text = _remove_invalid_xml(str(row[_TITLE_COLUMNS[layer.name]]))
@@ -172,20 +184,19 @@ def _placemark(
             text = repr(value) if isinstance(value, float) else str(value)
             data = ET.SubElement(extended, "Data", name=_remove_invalid_xml(key))
             ET.SubElement(data, "value").text = _remove_invalid_xml(text)
-    z_m = row.get("z_m") if layer.has_points else None
-    _geometry(mark, shape, z_m)
+    _geometry(mark, shape, altitude_m)
 
 
-def _geometry(parent: ET.Element, shape: Any, z_m: float | None) -> None:
+def _geometry(parent: ET.Element, shape: Any, altitude_m: float | None) -> None:
     import shapely
 
     match shape.geom_type:
         case "Point":
             point = ET.SubElement(parent, "Point")
-            if z_m is not None:
+            if altitude_m is not None:
                 ET.SubElement(point, "extrude").text = "1"
                 ET.SubElement(point, "altitudeMode").text = "relativeToGround"
-            ET.SubElement(point, "coordinates").text = _coordinates(shape, z_m)
+            ET.SubElement(point, "coordinates").text = _coordinates(shape, altitude_m)
         case "LineString":
             line = ET.SubElement(parent, "LineString")
             ET.SubElement(line, "tessellate").text = "1"
@@ -198,7 +209,7 @@ def _geometry(parent: ET.Element, shape: Any, z_m: float | None) -> None:
         case _:
             multi_geometry = ET.SubElement(parent, "MultiGeometry")
             for part in shapely.get_parts(shape):
-                _geometry(multi_geometry, part, z_m)
+                _geometry(multi_geometry, part, altitude_m)
 
 
 def _boundary(polygon: ET.Element, tag: str, ring: Any) -> None:
@@ -206,10 +217,10 @@ def _boundary(polygon: ET.Element, tag: str, ring: Any) -> None:
     ET.SubElement(linear_ring, "coordinates").text = _coordinates(ring)
 
 
-def _coordinates(shape: Any, z_m: float | None = None) -> str:
+def _coordinates(shape: Any, altitude_m: float | None = None) -> str:
     import shapely
 
-    height = "" if z_m is None else f",{z_m!r}"
+    height = "" if altitude_m is None else f",{altitude_m!r}"
     return " ".join(f"{x!r},{y!r}{height}" for x, y in shapely.get_coordinates(shape).tolist())
 
 

@@ -164,6 +164,21 @@ def _possible_names(key: re.Pattern[bytes], data: bytes) -> list[str]:
     return [name for line in lines for name in (line, *line.split())]
 
 
+SCENE_NODE = "egvs_world_z_up"
+"""The node of an exported scene that turns the world frame, z up, to that of glTF, y up."""
+
+
+def is_exported_scene(path: Path) -> bool:
+    """Return whether a file is a scene that ``egvs export --to glb`` wrote; a damaged file is none."""
+    if path.suffix.lower() not in (".gltf", ".glb"):
+        return False
+    try:
+        document = _parse_gltf_json(limits.read_bytes(path, limits.FILE))
+        return any(node.get("name") == SCENE_NODE for node in _objects_under(document, "nodes"))
+    except (ValueError, RecursionError):
+        return False
+
+
 MESH_FORMATS = ("ply", "obj", "stl", "glb", "gltf", "off")
 MESH_HINT = "Use a complete triangle mesh that trimesh can read: PLY, OBJ, STL, GLB."
 

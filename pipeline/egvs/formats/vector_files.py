@@ -5,8 +5,8 @@ GeoParquet (https://geoparquet.org) by pyarrow in another one (:mod:`egvs.format
 FeatureCollection with the member ``crs``, as GeoJSON files of this program have it. So the same rules apply to all
 formats. Coordinates stay in the system of the file, x before y.
 
-KML: the altitude of a point counts only where it is ``relativeToGround``; Google Earth writes 0 where it is clamped to
-the ground. The fields of LIBKML that describe how a placemark is drawn are left out.
+KML: the altitude of a point counts only where it is ``relativeToGround`` and there is no field ``z_m``; Google Earth
+writes 0 where it is clamped to the ground. The fields of LIBKML that describe how a placemark is drawn are left out.
 """
 
 from __future__ import annotations
@@ -175,6 +175,8 @@ def _feature(row: Mapping[str, Any], geometry_column: str, path: Path) -> dict[s
     if path.suffix.lower() == ".kml":
         shape = _kml_shape(shape, properties.get("altitudeMode"), f"{path}: {properties.get('Name') or '?'}")
         properties = dict(_kml_properties(properties))
+        if shape is not None and properties.get("z_m") not in (None, ""):
+            shape = shapely.force_2d(shape)  # z_m counts from z = 0, an altitude from the ground
     if shape is None:
         return {"type": "Feature", "geometry": None, "properties": properties}
     if shape.geom_type.startswith("Multi") and len(shape.geoms) == 1:

@@ -146,8 +146,12 @@ def _check_column_count(path: Path, names: Collection[str]) -> None:
         raise InputError(path, problem, "Remove columns that describe no site.")
 
 
-def read_features(path: Path, world: Georeference) -> Iterator[SiteRow]:
-    """Yield the features of a GeoJSON or GIS file as rows; InputError with file and feature for a malformed one."""
+def read_features(path: Path, world: Georeference, *, has_relief: bool = False) -> Iterator[SiteRow]:
+    """Yield the features of a GeoJSON or GIS file as rows; InputError with file and feature for a malformed one.
+
+    ``has_relief`` says whether the ground is elsewhere than at z = 0, so that altitudes of KML above the ground are no
+    z of the world frame.
+    """
     expected = "a FeatureCollection of Points"
     if vector_files.is_gis_file(path):
         document = vector_files.read_gis_file(path, "Point")
@@ -162,7 +166,12 @@ def read_features(path: Path, world: Georeference) -> Iterator[SiteRow]:
     reading = world.read_coordinates(coordinates, str(path), declared_crs(document, str(path)))
     for number, feature in enumerate(document["features"]):
         where = f"{path}: feature {number}"
-        yield SiteRow(where, _feature_columns(where, feature, reading))
+        columns = _feature_columns(where, feature, reading)
+        if has_relief and path.suffix.lower() == ".kml" and len(feature["geometry"]["coordinates"]) > 2:
+            problem = "expected the field z_m, since the ground is not at z = 0, got an altitude above the ground"
+            hint = "Add z_m (extended data): the altitude + z of the ground there."
+            raise InputError(f"{path}: site {columns.get('site', number)}", problem, hint)
+        yield SiteRow(where, columns)
 
 
 def _feature_columns(where: str, feature: Any, reading: CoordinateReading) -> dict[str, Any]:

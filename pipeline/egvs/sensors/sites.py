@@ -42,7 +42,8 @@ from egvs.scenario.model import Scenario, SiteGrid, SiteLine
 from egvs.sensors import site_files
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.site_files import SiteRow
-from egvs.world import geolocation
+from egvs.traffic import network, sumo_folder
+from egvs.world import geolocation, terrain
 
 Pitch = float | Literal["aim"]
 
@@ -192,11 +193,23 @@ def _site_rows(scenario: Scenario, path: Path) -> Iterator[SiteRow]:
     if config.file is not None:
         world = geolocation.scenario_georeference(scenario)
         if path.suffix.lower() in (".geojson", ".json") or vector_files.is_gis_file(path):
-            return site_files.read_features(path, world)
+            is_kml = path.suffix.lower() == ".kml"
+            return site_files.read_features(path, world, has_relief=is_kml and _has_relief(scenario))
         return site_files.read_csv(path, world)
     if config.grid is not None:
         return _grid_rows(config.grid)
     return _line_rows(config.along)
+
+
+def _has_relief(scenario: Scenario) -> bool:
+    """Whether the ground is elsewhere than at z = 0."""
+    if scenario.statics.terrain is not None:
+        return True
+    path = sumo_folder.network_path(scenario)
+    if path is None or not path.is_file() or not network.may_have_slopes(path):
+        return False
+    span_m, farthest_m = terrain.relief_m(network.read_net_xml(path))
+    return max(span_m, abs(farthest_m)) > terrain.MIN_RELIEF_M
 
 
 def _group_errors(errors: list[InputError]) -> Iterator[Diagnostic]:

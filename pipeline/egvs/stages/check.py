@@ -15,8 +15,8 @@ from egvs.core.wording import list_first
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
+from egvs.stages import height_checks, scene_checks, traffic_checks
 from egvs.stages import inputs as stage_inputs
-from egvs.stages import scene_checks, traffic_checks
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.inputs import CheckInputs, Inputs
 from egvs.stages.scene_dependencies import sensor_digests
@@ -28,6 +28,7 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     scene_checks.check_period_networks,
     traffic_checks.check_times,
     traffic_checks.check_sumo_files,
+    traffic_checks.check_sumo_locations,
     traffic_checks.check_period_weights,
     traffic_checks.check_demand,
     traffic_checks.check_signals,
@@ -46,8 +47,13 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     scene_checks.warn_dropped_sites,
     scene_checks.warn_solids_over_lanes,
     scene_checks.warn_solids_far_away,
+    height_checks.check_heights,
+    traffic_checks.check_traffic_heights,
 )
 """In the order in which findings are reported. A new rule is a function in this list."""
+
+_SCENE_MODULES = (scene_checks.__name__, height_checks.__name__)
+"""Modules of rules that read no traffic."""
 
 _RECORDED_TRAFFIC_KEY = "fcd"
 """Last part of the keys that name files of recorded traffic."""
@@ -166,7 +172,7 @@ def check_scene(inputs: Inputs) -> SceneReport | None:
         return None
     warnings = {}
     for rule in RULES:
-        if rule.__module__ != scene_checks.__name__:
+        if rule.__module__ not in _SCENE_MODULES:
             continue
         warnings[rule.__name__] = tuple(rule(readable))
         if any(finding.is_error for finding in warnings[rule.__name__]):

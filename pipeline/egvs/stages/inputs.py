@@ -33,7 +33,7 @@ from egvs.traffic.network import Network
 from egvs.world import geolocation, mesh, static_world
 from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
-from egvs.world.static_world import BuildCounts
+from egvs.world.static_world import BuildCounts, SolidSource
 
 if TYPE_CHECKING:
     from egvs.sensors.scanner import Scanner
@@ -302,6 +302,8 @@ class CheckInputs:
         All candidates; of a rule those where a pole can stand, if the static world is known.
     scene
         Sites and static world, without effects.
+    solid_sources
+        Which solids of the static world each file has.
     """
 
     scenario: Scenario
@@ -310,6 +312,7 @@ class CheckInputs:
     world: World | None = None
     sites: tuple[Site, ...] = ()
     scene: Scene | None = None
+    solid_sources: tuple[SolidSource, ...] = ()
 
     def site_location(self, site: Site) -> str:
         """Return the file or key, and the name, of a site, for messages."""
@@ -346,14 +349,16 @@ def resolve_check_inputs(inputs: Inputs) -> tuple[CheckInputs, list[Diagnostic]]
     scenario = inputs.scenario
     errors = ErrorCollector(list(missing_files(inputs)))
     network = errors.attempt("network", lambda: inputs.network)
-    world = errors.attempt("statics", lambda: inputs.built_world[0])
+    built = errors.attempt("statics", lambda: inputs.built_world)
+    world = None if built is None else built[0]
     if world is None:
         errors.findings += _static_file_errors(scenario)
     errors.attempt("zones", lambda: zones.weight_zones(scenario))
     errors.attempt("zones", lambda: zones.placement_zones(scenario))
     errors.attempt("zones", lambda: zones.reported_zones(scenario))
     carriageway = None if network is None else inputs.carriageway
-    readable = CheckInputs(scenario, network, carriageway, world)
+    sources = () if built is None else tuple(built[1].sources)
+    readable = CheckInputs(scenario, network, carriageway, world, solid_sources=sources)
 
     candidates = errors.attempt("sites", lambda: inputs.candidates)
     if candidates is None:

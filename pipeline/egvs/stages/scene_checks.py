@@ -72,13 +72,12 @@ def check_period_networks(inputs: CheckInputs) -> Iterator[Diagnostic]:
         if network is None or network is inputs.network:
             continue
         key = f"{scenario.file}: traffic.periods ({period})"
-        first_frame = None
-        if inputs.network is not None:
-            first_frame = geolocation.network_world_frame(inputs.network.location)
-        frame = geolocation.network_world_frame(network.location)
-        if first_frame is not None and frame is not None and first_frame != frame:
-            offsets = f"netOffset {list(frame.offset_m)} instead of {list(first_frame.offset_m)}"
-            problem = f"its network has another origin or projection than that of the first period ({offsets})"
+        difference = None
+        if inputs.network is not None and inputs.network.location is not None and network.location is not None:
+            difference = geolocation.location_difference(network.location, inputs.network.location)
+        if difference is not None:
+            statements = "{} instead of {}".format(*difference)
+            problem = f"its network has another origin or projection than that of the first period ({statements})"
             hint = "Use networks of one extract and one projection, so that all periods share a world frame."
             yield Diagnostic("region", key, problem, hint, is_error=True)
             continue

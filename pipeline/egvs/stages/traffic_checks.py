@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
 from egvs.artefacts import tpog
 from egvs.core.errors import Diagnostic, InputError
+from egvs.core.grid import FloatArray, Roi
 from egvs.effects import registry
+from egvs.formats import xml
 from egvs.scenario.model import Scenario
+from egvs.stages import height_checks
 from egvs.stages.inputs import CheckInputs, ErrorCollector
 from egvs.traffic import demand, fcd, finished_fcd, network, recording, sumo_folder, traffic_sources, user_files
-from egvs.world import geolocation
+from egvs.world import clearances, geolocation
 
 Rule = Callable[[CheckInputs], Iterator[Diagnostic]]
 
@@ -59,6 +66,44 @@ def check_sumo_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         if path.is_file() and not network.is_osm(path):
             errors.attempt("traffic", partial(user_files.check_copyable, path))
     yield from errors.findings
+
+
+@_for_each_period
+def check_sumo_locations(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report additional files of SUMO, and FCD, that state another offset or projection than the network."""
+    scenario = inputs.scenario
+    traffic = scenario.traffic
+    paths: list[Path] = []
+    try:
+        if not traffic.is_finished:
+            paths = list(sumo_folder.demand_files(scenario).files.get("additional-files", ()))
+        elif traffic.fcd is not None and not traffic.fcd_geo:
+            paths = [scenario.find(traffic.fcd, "traffic.fcd")]
+        expected = geolocation.network_location(scenario)
+    except InputError:
+        return  # another rule reports it
+    if expected is None:
+        return
+    errors = ErrorCollector()
+    for path in paths:
+        location = _stated_location(path)
+        if location is not None:
+            stated = geolocation.StatedLocation(str(path), location)
+            errors.attempt(
+                "traffic", partial(stated.check_same, expected, "Make it again with the scenario's network.")
+            )
+    yield from errors.findings
+
+
+def _stated_location(path: Path) -> network.Location | None:
+    """Return the ``<location>`` of an XML file; None for another file, and for one that another rule rejects."""
+    with xml.open_bounded(path) as file:
+        if not file.read(256).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
+            return None
+    try:
+        return network.read_location(path, "")
+    except InputError:
+        return None
 
 
 def check_period_weights(inputs: CheckInputs) -> Iterator[Diagnostic]:
@@ -160,6 +205,55 @@ def _check_recorded_position(scenario: Scenario, name: str) -> None:
     if finished_fcd.read_fcd_metadata(path) is None:
         world = geolocation.scenario_georeference(scenario)
         fcd.check_coordinates(path, world, scenario.traffic.fcd_geo)
+
+
+_ENOUGH_ROWS = 2000
+"""So many rows near the region tell at which height vehicles drive."""
+
+
+@_for_each_period
+def check_traffic_heights(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report recorded traffic whose heights have another zero than the network, or else the ground and the solids."""
+    scenario = inputs.scenario
+    traffic = scenario.traffic
+    if not traffic.is_finished:
+        return
+    try:
+        positions_m = _recorded_positions_m(scenario)
+    except InputError:
+        return  # check_finished_files reports it
+    key = f"{sumo_folder.traffic_location(scenario)}.{traffic_sources.source_key(traffic) or 'fcd'}"
+    if traffic.fcd is not None:
+        key += f" = {traffic.fcd!r}"
+    yield from height_checks.compare_traffic(inputs, inputs.carriageway, positions_m, key)
+
+
+def _recorded_positions_m(scenario: Scenario) -> FloatArray:
+    """Return the first positions of vehicles near the region, on the road, (n, 3), world frame."""
+    world = geolocation.scenario_georeference(scenario)
+    traffic = scenario.traffic
+    tables: Iterable[pa.Table]
+    if traffic.fcd is None:
+        tables = traffic_sources.source_of(scenario).record(scenario, world).rows
+    else:
+        path = scenario.find(traffic.fcd, "traffic.fcd")
+        tables = fcd.read_fcd(path)
+        if finished_fcd.read_fcd_metadata(path) is None:
+            tables = fcd.georeference_rows(tables, world, path, traffic.fcd_geo)
+    near = [np.empty((0, 3))]
+    for table in tables:
+        positions_m = np.column_stack([table[name].to_numpy() for name in ("x", "y", "z")])
+        near.append(positions_m[_is_near_region(positions_m, scenario.roi.box)])
+        if sum(map(len, near)) >= _ENOUGH_ROWS:
+            break
+    return np.concatenate(near)
+
+
+def _is_near_region(positions_m: FloatArray, box: Roi) -> NDArray[np.bool_]:
+    low_m = np.asarray(box.origin_m[:2]) - clearances.ROI_MARGIN_M
+    high_m = np.add(box.origin_m, box.size_m)[:2] + clearances.ROI_MARGIN_M
+    is_near: NDArray[np.bool_] = ((positions_m[:, :2] >= low_m) & (positions_m[:, :2] <= high_m)).all(axis=1)
+    return is_near
 
 
 @_for_each_period

@@ -24,6 +24,7 @@ from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.model import Scenario
 from egvs.scenario.settings import format_overrides
 from egvs.studies.footprint_files import read_document, write_if_changed
+from egvs.world.footprints import WORLD_DATUM, Z_DATUM
 
 OPTION = "--assumed-heights"
 
@@ -220,14 +221,18 @@ def _changed_run(
 
 
 def scale_heights(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
-    """Return a GeoJSON FeatureCollection with the assumed heights of buildings multiplied by a factor."""
+    """Return a GeoJSON FeatureCollection with the assumed heights of buildings multiplied by a factor.
+
+    Heights in z of the world frame are multiplied from their underside, which stays.
+    """
     features = []
     for feature in document["features"]:
         if _is_assumed(feature):
             properties = dict(feature["properties"])
+            zero_m = properties.get("base_m") or 0.0 if properties.get(Z_DATUM) == WORLD_DATUM else 0.0
             for key in ("height_m", "base_m"):
                 if key in properties and isinstance(properties[key], int | float):
-                    properties[key] = round(properties[key] * factor, 3)
+                    properties[key] = round(zero_m + (properties[key] - zero_m) * factor, 3)
             feature = {**feature, "properties": properties}
         features.append(feature)
     return {**document, "features": features}

@@ -37,6 +37,7 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.special import cosdg, sindg
 from egvs.core.wording import format_percent, number_of
 from egvs.drawing.basemap import solid_group
+from egvs.effects import registry
 from egvs.formats import csv_tables
 from egvs.results.command_entries import DIGEST_KEY, what_if_digest
 from egvs.results.labels import ScoreLabel, format_probability, join_names
@@ -57,7 +58,7 @@ from egvs.studies.footprint_files import read_document, write_if_changed
 from egvs.studies.paired_errors import SiteReplicates, read_replicates
 from egvs.traffic.class_sizes import class_sizes
 from egvs.world import geolocation
-from egvs.world.footprints import read_footprints
+from egvs.world.footprints import WORLD_DATUM, Z_DATUM, read_footprints
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
@@ -373,7 +374,9 @@ def solid_documents(scenario: Scenario, name: str) -> list[dict[str, Any]]:
         return documents
     trees = 0
     for file in scenario.statics.footprints:
-        grown, count = grow_trees(read_document(scenario.find(file, "statics.footprints")), table.tree_scale)
+        document = read_document(scenario.find(file, "statics.footprints"))
+        _check_tree_heights(document, scenario, f"{key}.tree_scale")
+        grown, count = grow_trees(document, table.tree_scale)
         trees += count
         documents.append(grown)
     if not trees:
@@ -485,6 +488,22 @@ def _box_feature(box: WhatIfBox, name: str) -> dict[str, Any]:
     return {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [ring]}, "properties": properties}
 
 
+def _check_tree_heights(document: Mapping[str, Any], scenario: Scenario, key: str) -> None:
+    """Raise an InputError when the trees of a file have no heights above the ground that could be multiplied."""
+    if registry.ground_effect(scenario) is None:
+        return
+    for feature in document["features"]:
+        properties = feature.get("properties") if isinstance(feature, dict) else None
+        if _is_tree(properties) and properties.get(Z_DATUM) == WORLD_DATUM:
+            problem = f"expected trees with heights above the ground, got z of the world frame ({Z_DATUM} = 'world')"
+            raise InputError(f"{scenario.file}: {key}", problem, "Use the footprints that were not exported.")
+
+
+def _is_tree(properties: Any) -> bool:
+    kind = properties.get("kind") if isinstance(properties, dict) else None
+    return isinstance(kind, str) and solid_group(kind, math.inf) == "green"
+
+
 def grow_trees(document: Mapping[str, Any], scale: float) -> tuple[dict[str, Any], int]:
     """Return a FeatureCollection in which trees and hedges are higher and wider, and their number.
 
@@ -503,8 +522,7 @@ def grow_trees(document: Mapping[str, Any], scale: float) -> tuple[dict[str, Any
     features, count = [], 0
     for feature in document["features"]:
         properties = feature.get("properties") if isinstance(feature, dict) else None
-        kind = properties.get("kind") if isinstance(properties, dict) else None
-        if isinstance(kind, str) and solid_group(kind, math.inf) == "green":
+        if _is_tree(properties):
             count += 1
             properties = dict(feature["properties"])
             for key in ("height_m", "radius_m"):

@@ -400,7 +400,7 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
                     nodes, ring = (tuple(element.attrib[key].split()) for key in ("nodes", "edges"))
                     roundabouts.append(Roundabout(nodes, ring))
                 case "location":
-                    location = _parse_location(element)
+                    location = parse_location(element, file.name)
         except (KeyError, ValueError, IndexError) as error:
             title = f"<{element.tag} id={element.get('id', element.get('from', ''))!r}>"
             raise InputError(file.name, f"invalid {title} for a SUMO network ({error!r})", _HINT) from None
@@ -471,9 +471,9 @@ def read_location(path: Path, root: str = "net") -> Location | None:
     Parameters
     ----------
     path
-        A network, or a file that polyconvert wrote.
+        A network, an additional file, or FCD.
     root
-        Tag of its root element.
+        Tag of its root element; any if empty.
 
     Returns
     -------
@@ -482,17 +482,18 @@ def read_location(path: Path, root: str = "net") -> Location | None:
     """
     for element in xml.iter_elements(path, root):
         if element.tag == "location":
-            try:
-                return _parse_location(element)
-            except (KeyError, ValueError) as error:
-                raise InputError(path, f"invalid <location> ({error!r})", _HINT) from None
-        if element.tag in ("edge", "poly"):
+            return parse_location(element, path)
+        if element.tag in ("edge", "timestep"):
             return None
     return None
 
 
-def _parse_location(element: Element) -> Location:
-    x, y = map(float, element.attrib["netOffset"].split(",")[:2])  # -1e10 in a network without roads
+def parse_location(element: Element, path: Path) -> Location:
+    """Return the georeference of an element ``<location>``; InputError naming the file when it is invalid."""
+    try:
+        x, y = map(float, element.attrib["netOffset"].split(",")[:2])  # -1e10 in a network without roads
+    except (KeyError, ValueError) as error:
+        raise InputError(path, f"invalid <location> ({error!r})", _HINT) from None
     return Location(element.get("projParameter", ""), (x, y))
 
 

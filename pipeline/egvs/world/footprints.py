@@ -4,8 +4,9 @@ Steps: read polygons, lines and points (:mod:`egvs.world.sumo_polygons` reads th
 projection to the world frame (:mod:`egvs.formats.georeference`); widen lines and points; repair what is unambiguous,
 with a count; reject the rest. World frame, metres.
 
-``height_m`` is the z of the top, ``base_m`` (default 0) the z of the underside. Points become discs of ``radius_m``,
-lines strips of that half width.
+``height_m`` is the height of the top, ``base_m`` (default 0) that of the underside. The property ``z_datum`` says where
+both count from: ``"ground"`` (default), the ground below the centre of the footprint, or ``"world"``, z = 0 of the
+world frame; on a flat ground these are the same. Points become discs of ``radius_m``, lines strips of that half width.
 """
 
 from __future__ import annotations
@@ -36,8 +37,11 @@ _MAX_SLIVER_SHARE = 0.01
 # sides of a quarter of a disc
 _QUARTER_SIDES = 4
 
+Z_DATUM, GROUND_DATUM, WORLD_DATUM = "z_datum", "ground", "world"
+"""The property that states where heights count from, and its values. A Shapefile cuts names after ten characters."""
+
 # properties that must not be misspelt
-_HEIGHT_KEYS = ("height_m", "base_m")
+_HEIGHT_KEYS = ("height_m", "base_m", Z_DATUM)
 # properties that ``egvs new`` adds as notes
 _NOTE_KEYS = ("height_from",)
 # invalid features of a file that are reported one by one
@@ -46,13 +50,17 @@ _MAX_REPORTED = 20
 
 @dataclass(frozen=True)
 class Footprint:
-    """A polygon (world frame, metres, may have holes) that is extruded from ``base_m`` to ``height_m``."""
+    """A polygon (world frame, metres, may have holes) that is extruded from ``base_m`` to ``height_m``.
+
+    ``z_datum`` is where both count from, :data:`GROUND_DATUM` or :data:`WORLD_DATUM`.
+    """
 
     name: str
     kind: str
     polygon: Polygon
     base_m: float
     height_m: float
+    z_datum: str = GROUND_DATUM
 
 
 @dataclass(frozen=True)
@@ -169,8 +177,13 @@ def _feature_footprints(
     if not height_m > base_m:
         raise InputError(where, f"expected height_m above base_m = {base_m:g}, got {height_m:g}")
     kind = str(_property(properties, "kind", "footprint"))
+    z_datum = _property(properties, Z_DATUM, GROUND_DATUM)
+    if z_datum not in (GROUND_DATUM, WORLD_DATUM):
+        hint = "Use ground for heights above the ground below, world for z of the world frame."
+        problem = f"expected {GROUND_DATUM!r} or {WORLD_DATUM!r}, got {repr(z_datum)[:80]}"
+        raise InputError(f"{where}: {Z_DATUM}", problem, hint)
     polygons = to_polygons(feature.get("geometry"), properties, where, repaired, reading)
-    return [Footprint(name, kind, polygon, base_m, height_m) for polygon in polygons]
+    return [Footprint(name, kind, polygon, base_m, height_m, z_datum) for polygon in polygons]
 
 
 def _report_errors(errors: list[InputError], path: Path) -> Iterator[Diagnostic]:

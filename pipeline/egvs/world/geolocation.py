@@ -6,6 +6,7 @@ how it converted longitude and latitude. If both are given, they are compared.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,9 @@ from egvs.traffic.network import Location
 
 _TOLERANCE_M = 10.0
 """Different datums differ by less once transformed; a forgotten offset or a wrong zone by far more."""
+
+_SAME_OFFSET_M = 0.01
+"""SUMO writes offsets with two digits."""
 
 _NO_PROJECTION = ("", "!")
 """SUMO's entries for a network that was not made from a map."""
@@ -98,6 +102,64 @@ def network_world_frame(location: Location | None) -> WorldFrame | None:
         return None
 
 
+@dataclass(frozen=True)
+class StatedLocation:
+    """The ``<location>`` of a SUMO file; ``file`` names it in messages."""
+
+    file: str
+    location: Location
+
+    def check_same(self, other: StatedLocation, hint: str) -> None:
+        """Raise an InputError, at this file, when another file states another offset or projection."""
+        difference = location_difference(self.location, other.location)
+        if difference:
+            own, others = difference
+            raise InputError(self.file, f"its <location> states {own}, but that of {other.file} {others}", hint)
+
+
+def location_difference(location: Location, other: Location) -> tuple[str, str] | None:
+    """Return how two files of SUMO state different world frames: both statements, or None where they agree.
+
+    Nothing is converted: without a projection, nobody knows whether two offsets count from the same origin.
+
+    >>> location_difference(Location("!", (30.0, 0.0)), Location("!", (0.0, 0.0)))
+    ('netOffset 30,0', 'netOffset 0,0')
+    """
+    offset_m = np.subtract(location.offset_m, other.offset_m)
+    same_offset = bool(np.abs(offset_m).max() <= _SAME_OFFSET_M)
+    same_projection = _normalized_projection(location) == _normalized_projection(other)
+    if same_offset and same_projection:
+        return None
+    own, others = _describe_offset(location), _describe_offset(other)
+    if same_projection:
+        return own, others
+    return f"{own} and {_describe_projection(location)}", f"{others} and {_describe_projection(other)}"
+
+
+def network_location(scenario: Scenario) -> StatedLocation | None:
+    """Return the ``<location>`` of the network of a scenario; None if there is no network, or it states none."""
+    path = _network_path(scenario)
+    if path is None:
+        return None
+    location = _read_network_location(path)
+    return None if location is None else StatedLocation(f"the network {path.name}", location)
+
+
+def _normalized_projection(location: Location) -> str:
+    projection = " ".join(location.projection.split())
+    return "" if projection in _NO_PROJECTION else projection
+
+
+def _describe_offset(location: Location) -> str:
+    x, y = location.offset_m
+    return f"netOffset {x:.10g},{y:.10g}"
+
+
+def _describe_projection(location: Location) -> str:
+    projection = _normalized_projection(location)
+    return f"projParameter {projection!r}" if projection else "no projection"
+
+
 def _declared_frame(scenario: Scenario) -> WorldFrame | None:
     crs = scenario.crs
     if crs.epsg is None:
@@ -115,13 +177,15 @@ def _network_path(scenario: Scenario) -> Path | None:
 
 
 def _network_frame(scenario: Scenario) -> WorldFrame | None:
-    path = _network_path(scenario)
-    if path is None:
-        return None
-    if network.is_osm(path):
-        status = path.stat()
-        return network_world_frame(_converted_location(path, status.st_mtime_ns, status.st_size))
-    return network_world_frame(network.read_location(path))
+    stated = network_location(scenario)
+    return None if stated is None else network_world_frame(stated.location)
+
+
+def _read_network_location(path: Path) -> Location | None:
+    if not network.is_osm(path):
+        return network.read_location(path)
+    status = path.stat()
+    return _converted_location(path, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=4)

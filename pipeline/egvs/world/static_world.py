@@ -4,7 +4,8 @@ Steps: read footprints (:mod:`egvs.world.footprints`) and extrude them from ``ba
 into closed solids and open surfaces; add a ground plane at z = 0. World frame, metres.
 
 A ground with relief replaces the plane. Then both heights of a footprint are relative to the ground below its centre,
-and objects that stand on the ground reach down to its lowest point along their outline.
+and objects that stand on the ground reach down to its lowest point along their outline. Footprints that state heights
+of the world frame (``z_datum``), such as exported ones, stay as they are.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core.errors import WARNINGS_KEY, Diagnostic
+from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats import meshes
 from egvs.formats.georeference import Georeference
@@ -26,10 +27,10 @@ from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import MeshConfig, Scenario
 from egvs.world import geolocation
 from egvs.world.extrusion import extrude_polygon
-from egvs.world.footprints import Footprint, read_footprints
+from egvs.world.footprints import GROUND_DATUM, Footprint, read_footprints
 from egvs.world.map_features import SolidTypes
 from egvs.world.mesh import World
-from egvs.world.sumo_polygons import read_poly_xml
+from egvs.world.sumo_polygons import read_poly_location, read_poly_xml
 from egvs.world.terrain import GroundSource, TerrainSurface
 
 Floats = NDArray[np.float64]
@@ -39,13 +40,41 @@ GROUND_MARGIN_M = 500.0
 
 
 @dataclass(frozen=True)
+class SolidSource:
+    """The solids of a file, from the number ``first`` to before ``end``; ``key`` of the scenario names the file."""
+
+    key: str
+    name: str
+    first: int
+    end: int
+
+    @property
+    def where(self) -> str:
+        """The key and the file, for messages."""
+        return f"{self.key} = {self.name!r}"
+
+    def zero_hint(self, change_m: float) -> str:
+        """Return how to change where the heights of the file count from, by a number of metres."""
+        change = f"{change_m:+,.1f} m"
+        if self.key == _MESHES:
+            return f"Add {change} to the third number of its offset_m."
+        if self.key == _POLYGONS:
+            return f"Add {change} to its heights (height, min_height): they count from the ground."
+        return f"Add {change} to base_m and height_m: they count from the ground, or with z_datum = 'world' from z = 0."
+
+
+_FOOTPRINTS, _POLYGONS, _MESHES = "statics.footprints", "statics.polygons", "statics.meshes"
+
+
+@dataclass(frozen=True)
 class BuildCounts:
-    """What was built (solids by kind), repaired and left out, with counts, and warnings."""
+    """What was built (solids by kind), repaired and left out, with counts; warnings; the solids of each file."""
 
     built: Counter[str] = field(default_factory=Counter)
     repaired: Counter[str] = field(default_factory=Counter)
     ignored: Counter[str] = field(default_factory=Counter)
     warnings: list[Diagnostic] = field(default_factory=list)
+    sources: list[SolidSource] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
         """Return the form in the summary of a stage."""
@@ -84,12 +113,19 @@ def build_world(
     builder = _Builder()
     world = geolocation.scenario_georeference(scenario)
     types = SolidTypes(config.polygon_types)
-    files = [read_footprints(scenario.find(name, "statics.footprints"), world) for name in config.footprints]
-    polygons = [scenario.find(name, "statics.polygons") for name in config.polygons]
-    files += [read_poly_xml(path, types, config.polygon_height_m, world) for path in polygons]
-    footprints = []
-    for file in files:
+    files = [read_footprints(scenario.find(name, _FOOTPRINTS), world) for name in config.footprints]
+    names = [(_FOOTPRINTS, name) for name in config.footprints]
+    location = geolocation.network_location(scenario)
+    for name in config.polygons:
+        path = scenario.find(name, _POLYGONS)
+        files.append(read_poly_xml(path, types, config.polygon_height_m, world, location))
+        names.append((_POLYGONS, name))
+        location = location or read_poly_location(path)
+    footprints: list[Footprint] = []
+    for (key, name), file in zip(names, files, strict=True):
+        first = len(footprints)
         footprints += file.footprints
+        builder.counts.sources.append(SolidSource(key, name, first, len(footprints)))
         builder.counts.repaired.update(file.repaired)
         builder.counts.ignored.update(file.ignored)
         builder.counts.warnings.extend(file.warnings)
@@ -98,11 +134,14 @@ def build_world(
     if ground is not None:
         surface = ground.ground(scenario, *_ground_extent_m(scenario, footprints))
     for done, footprint in enumerate(footprints):
-        lifted = footprint if surface is None else _lift_to_surface(surface, footprint)
+        counts_from_ground = footprint.z_datum == GROUND_DATUM
+        lifted = _lift_to_surface(surface, footprint) if surface is not None and counts_from_ground else footprint
         builder.add(*_extrude(lifted), footprint.name, footprint.kind)
         progress("footprints", done + 1, len(footprints))
     for mesh in config.meshes:
-        _add_mesh(builder, scenario.find(mesh.file, "statics.meshes"), mesh, world)
+        first = len(builder.solids)
+        _add_mesh(builder, scenario.find(mesh.file, _MESHES), mesh, world)
+        builder.counts.sources.append(SolidSource(_MESHES, mesh.file, first, len(builder.solids)))
     if config.ground and surface is not None:
         builder.add(surface.vertices_m, surface.faces, "ground", "ground")
     elif config.ground:
@@ -146,6 +185,9 @@ def _extrude(footprint: Footprint) -> tuple[Floats, NDArray[np.int64]]:
 
 def _add_mesh(builder: _Builder, path: Path, config: MeshConfig, world: Georeference) -> None:
     """Add each closed piece of a mesh as a solid, so that sites inside are detected; the rest is one open surface."""
+    if meshes.is_exported_scene(path):
+        hint = "Use statics.ply of that run: the same solids in the world frame, z up, without sensors."
+        raise InputError(path, "is the exported scene of a run, with y up and with its sensors and ground", hint)
     mesh, dropped = meshes.load_clean_mesh(path, MAX_COORDINATE_M)
     if dropped:
         builder.counts.repaired["degenerate or doubled triangles dropped"] += dropped

@@ -5,7 +5,8 @@ walls and barriers; cut out courtyards, which polyconvert writes as polygons of 
 shape (attribute or parameter ``height``, or tags that ``polyconvert --all-attributes`` keeps), else of its type.
 
 A shape is in metres of the file's own ``<location>``, or of the world frame if there is none. With ``geo``, it is in
-degrees, as are points with ``lon`` and ``lat``.
+degrees, as are points with ``lon`` and ``lat``. Metres of another ``<location>`` than that of the network are converted
+through longitude and latitude, and counted; without a known projection on both sides they are an error.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from egvs.core.numbers import number_or_nan
 from egvs.core.wording import list_first
 from egvs.formats import xml
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference
-from egvs.traffic.network import read_location
+from egvs.traffic.network import Location, parse_location
 from egvs.world.footprints import CROSSING_RINGS, Footprint, FootprintFile, to_polygons
-from egvs.world.geolocation import network_world_frame
+from egvs.world.geolocation import StatedLocation, network_world_frame
 from egvs.world.map_features import POLE_TYPES, TRUNK_RADIUS_M, SolidType, SolidTypes, is_underground, vertical_extent
 
 if TYPE_CHECKING:
@@ -42,11 +43,14 @@ _NO_TYPE = "(none)"
 # types, and shapes, that a warning names
 _MAX_LISTED = 12
 _HINT = "Make the file with polyconvert and the scenario's network (-n)."
+_LOCATION_HINT = f"{_HINT} If its shapes are in metres of the network, remove <location>."
 
 Points = list[tuple[float, float]]
 
 
-def read_poly_xml(path: Path, types: SolidTypes, height_m: float, world: Georeference) -> FootprintFile:
+def read_poly_xml(
+    path: Path, types: SolidTypes, height_m: float, world: Georeference, expected: StatedLocation | None = None
+) -> FootprintFile:
     """Read the footprints of solid shapes.
 
     Parameters
@@ -59,6 +63,8 @@ def read_poly_xml(path: Path, types: SolidTypes, height_m: float, world: Georefe
         Top of solids that have no height and whose type has none.
     world
         Where the world frame is.
+    expected
+        The ``<location>`` of the network, or else of another file of the scenario.
 
     Returns
     -------
@@ -70,7 +76,7 @@ def read_poly_xml(path: Path, types: SolidTypes, height_m: float, world: Georefe
     InputError
         When a solid is invalid, or the file is of another location.
     """
-    reader = _PolygonReader(path, types, height_m, world)
+    reader = _PolygonReader(path, types, height_m, world, expected)
     for number, element in enumerate(xml.iter_elements(path, "additional")):
         reader.add_element(number, element)
     return reader.finish()
@@ -118,13 +124,14 @@ class _Shape:
 class _PolygonReader:
     """Collects the solids of one file, shape by shape."""
 
-    def __init__(self, path: Path, types: SolidTypes, height_m: float, world: Georeference) -> None:
-
+    def __init__(
+        self, path: Path, types: SolidTypes, height_m: float, world: Georeference, expected: StatedLocation | None
+    ) -> None:
         self._path = path
         self._types = types
         self._height_m = height_m
         self._world = world
-        self._readings = _coordinate_readings(path, world)
+        self._readings = _coordinate_readings(path, world, expected)
         self._file = FootprintFile()
         self._polygon_count = 0
         self._unknown_types = Counter[str]()
@@ -222,6 +229,9 @@ class _PolygonReader:
         if height is not None:
             _check_height(height, shape.where)
             tags = {**tags, "height": height}
+        reading = self._readings[shape.is_geographic]
+        if areas and reading is not None and reading.convert is not None:
+            self._file.repaired[f"shapes in {reading.description}, brought into the world frame"] += 1
         extent = vertical_extent(tags, solid, self._height_m)
         for what in extent.unreadable:
             self._file.repaired[f"{what} that cannot be read, taken as not there"] += 1
@@ -312,7 +322,21 @@ def _is_true(element: Element, attribute: str) -> bool:
     return element.get(attribute, "false").lower() in ("true", "1")
 
 
-def _coordinate_readings(path: Path, world: Georeference) -> dict[bool, CoordinateReading | None]:
+def read_poly_location(path: Path) -> StatedLocation | None:
+    """Return the ``<location>`` of a file, wherever it is in it; None for a file without, InputError for a second."""
+    location: Location | None = None
+    for element in xml.iter_elements(path, "additional"):
+        if element.tag != "location":
+            continue
+        if location is not None:
+            raise InputError(path, "there are two <location>s", "Keep the one that its shapes are in.")
+        location = parse_location(element, path)
+    return None if location is None else StatedLocation(str(path), location)
+
+
+def _coordinate_readings(
+    path: Path, world: Georeference, expected: StatedLocation | None
+) -> dict[bool, CoordinateReading | None]:
     """Return the conversion to the world frame of shapes in degrees (True) and in metres (False).
 
     It is None for degrees if the position of the world frame is unknown; this only matters if a solid is in degrees.
@@ -329,7 +353,12 @@ def _coordinate_readings(path: Path, world: Georeference) -> dict[bool, Coordina
                     metres += points
             elif element.tag == "poi" and "lon" in element.attrib:
                 degrees += _parse_points(f"{element.get('lon')},{element.get('lat')}", "")
-    own_frame = network_world_frame(read_location(path, "additional"))
+            elif element.tag == "poi":
+                metres += _parse_points(f"{element.get('x')},{element.get('y')}", "")
+    stated = read_poly_location(path)
+    own_frame = None if stated is None else network_world_frame(stated.location)
+    if metres and stated is not None and expected is not None and (own_frame is None or world.frame is None):
+        stated.check_same(expected, _LOCATION_HINT)
     in_degrees = None
     if world.frame is not None:
         in_degrees = world.read_coordinates(_finite_points(degrees), str(path), WGS84, _HINT)

@@ -281,6 +281,23 @@ def test_warns_about_flat_junction_in_hilly_network(city: City) -> None:
     assert problems == ["the network has slopes, but the ground of west is level, because they name no roads"]
 
 
+def test_traffic_of_junction_keeps_heights(city: City) -> None:
+    """The town lies on a hill: rows of a junction have the z and the slope of the town's rows."""
+    path = city.folder / "fcd.csv"
+    header, *rows = path.read_text().splitlines()
+    lifted = []
+    for row in rows:
+        x_m = float(row.split(";")[2])
+        lifted.append(f"{row};{100 + x_m / 10:.6f};{5.710593}")
+    path.write_text("\n".join([f"{header};vehicle_z;vehicle_slope", *lifted]) + "\n")
+    traffic_split.make_city_traffic(city)
+    for name in ("west", "east"):
+        (table,) = fcd.read_fcd(city.folder / "traffic" / f"{name}.parquet")
+        assert table.num_rows > 0
+        assert table["z"].to_numpy() == pytest.approx(100 + table["x"].to_numpy() / 10, abs=1e-6)
+        assert set(table["slope"].to_pylist()) == {5.710593}
+
+
 def test_rejects_second_process(city: City) -> None:
     def start_another(_what: str, _done: int, _total: int) -> None:
         with pytest.raises(RunError, match="another run is using this folder"):

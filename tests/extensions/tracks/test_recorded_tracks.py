@@ -369,3 +369,15 @@ def test_tracks_stand_on_a_sloping_road(mini: Path, run_egvs, tmp_path: Path) ->
     np.testing.assert_allclose(table["pitch_rad"].to_numpy(), math.atan(0.1), atol=2e-3)
     centre_m = 5.0 + 0.1 * table["x_m"].to_numpy() + 0.75 * math.cos(math.atan(0.1))
     np.testing.assert_allclose(table["z_m"].to_numpy(), centre_m, atol=0.05)
+
+
+def test_solids_of_another_zero_than_tracks_are_an_error(mini: Path, run_egvs) -> None:
+    """Without a network, tracks are at z = 0; solids and sensors above sea level are nowhere near them."""
+    use_tracks(mini, interaction_csv(boxes_of_fcd()))
+    assert "heights" not in run_egvs("check", mini)[1]
+    ring = [[14, 5], [18, 5], [18, 8], [14, 8], [14, 5]]
+    house = feature({"type": "Polygon", "coordinates": [ring]}, name="house", height_m=118, base_m=112)
+    (mini / "statics.geojson").write_text(collection(house))
+    code, out, _ = run_egvs("check", mini)
+    assert code == 2
+    assert "1 of 1 solid near the region has its foot 112.0 m above the traffic beside it: house" in out

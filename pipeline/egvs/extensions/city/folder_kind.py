@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
 from egvs.export.finished_run import FinishedRun
 from egvs.export.layers import (
     JUNCTIONS,
@@ -18,6 +20,7 @@ from egvs.export.layers import (
     REGION,
     SITES,
     Layer,
+    ground_heights_m,
     point_geometries,
     region_geometries,
     region_row,
@@ -57,11 +60,14 @@ class CityFolder:
         planned = results.read_plan(folder, _junction_names(folder))
         if planned is not None and planned.sensors:
             sensors, _ = parquet.read_artefact(folder / results.PLAN_TABLE, "city_plan")
-            layers.append(Layer(PLAN, point_geometries(sensors), to_plain_table(sensors)))
+            ground_m = _ground_m(folder, sensors)
+            layers.append(Layer(PLAN, point_geometries(sensors), to_plain_table(sensors), ground_m=ground_m))
         elif planned is None and (folder / results.PLAN_TABLE).is_file():
             notes.append("the plan is left out: it is for other junctions or settings. Run egvs city place again")
         first = ["rank", *(name for name in scores.column_names if name != "rank")]
-        layers.append(Layer(SITES, point_geometries(scores), to_plain_table(scores.select(first)), metadata["rank_by"]))
+        sites = to_plain_table(scores.select(first))
+        ground_m = _ground_m(folder, scores)
+        layers.append(Layer(SITES, point_geometries(scores), sites, metadata["rank_by"], ground_m=ground_m))
         layers.append(_region_layer(folder))
         return layers, notes
 
@@ -71,6 +77,18 @@ class CityFolder:
 
 
 KIND = CityFolder()
+
+
+def _ground_m(folder: Path, sensors: pa.Table) -> FloatArray:
+    """Return z of the ground below sensors, (n,), each in the world of its junction."""
+    heights_m = np.zeros(len(sensors))
+    junctions = np.array(sensors.column(_JUNCTION_COLUMN).to_pylist(), dtype=object)
+    for name in _junction_names(folder):
+        rows = np.flatnonzero(junctions == name)
+        if rows.size:
+            run = FinishedRun.open(results.junction_run_folder(folder, name))
+            heights_m[rows] = ground_heights_m(run.work.world, sensors.take(pa.array(rows)))
+    return heights_m
 
 
 def _region_layer(folder: Path) -> Layer:
