@@ -31,7 +31,7 @@ class Confinement:
     has_network
         Whether it may open sockets.
     memory_bytes
-        Largest address space; None: no limit.
+        Largest memory that it may allocate; None: no limit.
     processor_s
         Longest time of work, seconds; None: no limit.
     """
