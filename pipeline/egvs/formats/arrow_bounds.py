@@ -148,8 +148,8 @@ def _check_parts(parts: int, where: object) -> None:
 
 def _read_at(file: IO[bytes], position: int, size: int) -> bytes:
     """Return bytes of a file; ValueError when it does not have them."""
-    if position < 0 or size < 0:
-        raise ValueError("a position in it is negative")
+    if size < 0 or not 0 <= position <= file.seek(0, io.SEEK_END):
+        raise ValueError("a position in it is outside of it")
     file.seek(position)
     data = file.read(size)
     if len(data) < size:
