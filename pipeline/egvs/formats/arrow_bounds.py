@@ -35,8 +35,9 @@ _MAX_DEPTH = 8
 _PLAIN_HINT = "Save it again with pyarrow or pandas, with their usual settings."
 
 _ENCODINGS = {0: "PLAIN", 2: "PLAIN_DICTIONARY", 3: "RLE", 4: "BIT_PACKED", 5: "DELTA_BINARY_PACKED",
-              6: "DELTA_LENGTH_BYTE_ARRAY", 7: "DELTA_BYTE_ARRAY", 8: "RLE_DICTIONARY", 9: "BYTE_STREAM_SPLIT"}  # fmt: skip
-_REPEATING = 7
+              6: "DELTA_LENGTH_BYTE_ARRAY", 8: "RLE_DICTIONARY", 9: "BYTE_STREAM_SPLIT"}  # fmt: skip
+_REPEATING = {7: "DELTA_BYTE_ARRAY"}
+"""Encodings by their number; those that are read, and one in which a value repeats the one before it."""
 _UNPACKED_SIZE, _PACKED_SIZE, _DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_V2 = 2, 3, 5, 7, 8
 """Fields of a PageHeader."""
 _ENCODING_FIELDS = {_DATA_PAGE: 2, _DICTIONARY_PAGE: 2, _DATA_PAGE_V2: 4}
@@ -186,8 +187,8 @@ class _PageReader:
         return size
 
     def _check_encoding(self, encoding: int, chunk: Any) -> None:
-        if encoding == _REPEATING or encoding not in _ENCODINGS:
-            problem = f"the encoding {_ENCODINGS.get(encoding, encoding)} is not supported"
+        if encoding not in _ENCODINGS:
+            problem = f"the encoding {_REPEATING.get(encoding, encoding)} is not supported"
             raise InputError(f"{self._where}: {chunk.path_in_schema}", problem, _PLAIN_HINT)
 
 
