@@ -82,6 +82,7 @@ ELEMENT = Limit("EGVS_MAX_ELEMENT_MB", 16, "MB", "one element below the root of 
 XML_ELEMENTS = Limit("EGVS_MAX_XML_ELEMENTS", 10_000_000, "elements", "an XML file")
 POINTS = Limit("EGVS_MAX_POINTS", 30_000_000, "points", "a point cloud")
 TRIANGLES = Limit("EGVS_MAX_TRIANGLES", 5_000_000, "triangles", "a mesh")
+HOLES = Limit("EGVS_MAX_HOLES", 5000, "holes", "one polygon: the time to triangulate it grows with their square")
 SITES = Limit("EGVS_MAX_SITES", 100_000, "candidates", "a scenario's sites")
 BEAMS = Limit("EGVS_MAX_BEAMS", 3_000_000, "beams", "one turn of a sensor")
 VOXELS = Limit("EGVS_MAX_VOXELS", 2**30, "voxels", "a region of interest")

@@ -9,7 +9,6 @@ are checked for completeness, because SUMO ends without an error on a full disk.
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import shutil
@@ -92,7 +91,7 @@ class Allowance:
     @classmethod
     def for_input(cls, folder: Path, time_steps: int = 0) -> Allowance:
         """Return the allowance for the files in a folder, and a number of time steps to simulate."""
-        size_mb = math.ceil(sum(file.stat().st_size for file in folder.iterdir() if file.is_file()) / limits.MB)
+        size_mb = sum(file.stat().st_size for file in folder.iterdir() if file.is_file()) // limits.MB
         work_s = limits.SUMO_TIME.maximum + _S_PER_INPUT_MB * size_mb + time_steps
         return cls(limits.SUMO_MEMORY.maximum + _MB_PER_INPUT_MB * size_mb, work_s)
 
