@@ -47,10 +47,11 @@ def test_sumo_has_a_limit_of_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.skipif(not LINUX, reason="only Linux limits the memory of a process")
 def test_sumo_has_a_limit_of_memory(town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The real program, with a route of 400 million edges."""
+    """The real program, with vehicles that wait to depart."""
+    edge = first_lane(town / "net.xml")[0]
     shutil.copy(town / "net.xml", tmp_path)
-    route = '<route edges="A0A1 A1B1 B1B0 B0A0" repeat="100000000"/>'
-    (tmp_path / "r.rou.xml").write_text(f'<routes><vehicle id="v" depart="0">{route}</vehicle></routes>')
+    flow = f'<flow id="f" begin="0" end="60" number="1000000000"><route edges="{edge}"/></flow>'
+    (tmp_path / "r.rou.xml").write_text(f"<routes>{flow}</routes>")
     monkeypatch.setenv(limits.SUMO_MEMORY.name, "300")
     message = r"^sumo needed more than 300 MB of memory\. The limit is 300 MB; set EGVS_MAX_SUMO_MB to raise it$"
     with pytest.raises(sumo.SumoInputError, match=message):
