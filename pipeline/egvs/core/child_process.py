@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -16,6 +17,10 @@ from egvs.core import sandbox
 
 _SYSTEM_FILES = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache", "/etc/localtime", "/dev/urandom", "/dev/zero")
 """What the libraries of a system read, beside what they are asked to."""
+
+
+OUT_OF_MEMORY = re.compile(r"bad_alloc|MemoryError|more memory|out ?of ?memory|cannot allocate", re.IGNORECASE)
+"""What programs write when an allocation fails, in C++, in Python, in Rust, and in the XML parser Xerces."""
 
 
 @dataclass(frozen=True)

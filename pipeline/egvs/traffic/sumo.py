@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from egvs.core import limits, sandbox
-from egvs.core.child_process import Confinement, start_program
+from egvs.core.child_process import OUT_OF_MEMORY, Confinement, start_program
 from egvs.core.errors import InputError, MissingBackendError, RunError
 from egvs.core.resource_usage import processor_seconds_of
 from egvs.core.sumo_home import sumo_home
@@ -54,8 +54,6 @@ _CRASHES = frozenset({signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGI
 """Signals of a program that crashed, in contrast to one that was killed."""
 
 _OUT_OF_TIME = getattr(signal, "SIGXCPU", 0)
-_OUT_OF_MEMORY = re.compile(r"bad_alloc|MemoryError|out ?of ?memory", re.IGNORECASE)
-"""What programs write when an allocation fails: those in C++, in Python, and the XML parser Xerces."""
 
 _MB_PER_INPUT_MB, _S_PER_INPUT_MB = 20, 10
 """Memory and time of a program, beside the limits. Measured: a grid of 4,900 junctions (49 MB) takes 346 MB and 4 s in
@@ -353,7 +351,7 @@ def program_error(name: str, code: int, text: str, allowance: Allowance) -> RunE
     """
     if code == -_OUT_OF_TIME:
         return _limit_error(f"{name} worked for more than {allowance.work_s:,} s", limits.SUMO_TIME)
-    if code and _OUT_OF_MEMORY.search(text):
+    if code and OUT_OF_MEMORY.search(text):
         return _limit_error(f"{name} needed more than {allowance.memory_mb:,} MB of memory", limits.SUMO_MEMORY)
     missing = re.search(r"error while loading shared libraries: ([^:\s]+)", text)
     if missing:
