@@ -19,7 +19,9 @@ _SYSTEM_FILES = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache", "/etc/localtime",
 """What the libraries of a system read, beside what they are asked to."""
 
 
-OUT_OF_MEMORY = re.compile(r"bad_alloc|MemoryError|more memory|out ?of ?memory|cannot allocate", re.IGNORECASE)
+OUT_OF_MEMORY = re.compile(
+    r"bad_alloc|MemoryError|more memory|out ?of ?memory|cannot allocate|memory allocation", re.IGNORECASE
+)
 """What programs write when an allocation fails, in C++, in Python, in Rust, and in the XML parser Xerces."""
 
 
