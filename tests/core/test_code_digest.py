@@ -166,11 +166,11 @@ def test_library_versions_are_those_installed() -> None:
 
 MOST_LINES = {
     "check": 15_000,
-    "statics": 9_500,
-    "scan": 11_300,
+    "statics": 9_800,
+    "scan": 11_600,
     "traffic": 9_800,
     "tpog": 4_000,
-    "score": 16_000,
+    "score": 16_200,
     "report": 19_100,
 }
 """Code lines behind the key of each stage, at most: a stage runs again whenever one of them changes."""
