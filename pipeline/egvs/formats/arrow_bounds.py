@@ -23,7 +23,6 @@ from egvs.core.reading import COMPLETE_FILE
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
 MAX_TEXT_BYTES = 1000
 """Longest text of a column: the name of a vehicle or of its type."""
@@ -44,15 +43,13 @@ _ENCODING_FIELDS = {_DATA_PAGE: 2, _DICTIONARY_PAGE: 2, _DATA_PAGE_V2: 4}
 """Headers of the kinds of pages, and their field with the encoding; field 1 is the number of values."""
 
 
-def parquet_group_bytes(
-    file: pq.ParquetFile, source: Path | IO[bytes], columns: Sequence[str], where: object
-) -> list[int]:
+def parquet_group_bytes(file: Any, source: Path | IO[bytes], columns: Sequence[str], where: object) -> list[int]:
     """Return how many bytes some columns of each row group have after decompression.
 
     Parameters
     ----------
     file
-        The open file.
+        The open pyarrow.parquet.ParquetFile.
     source
         Its path, or its content.
     columns
