@@ -165,12 +165,12 @@ def test_library_versions_are_those_installed() -> None:
 
 
 MOST_LINES = {
-    "check": 15_400,  # with the comparison of heights
-    "statics": 9_500,
-    "scan": 11_300,
+    "check": 15_400,
+    "statics": 9_800,
+    "scan": 11_600,
     "traffic": 9_800,
     "tpog": 4_000,
-    "score": 16_000,
+    "score": 16_200,
     "report": 19_100,
 }
 """Code lines behind the key of each stage, at most: a stage runs again whenever one of them changes."""

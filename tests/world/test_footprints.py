@@ -177,3 +177,15 @@ def test_reports_all_wrong_features_at_once(tmp_path: Path) -> None:
     assert "feature 1 (t): height_m: expected metres, at most 1e+08, got 'tall'" in messages[0]
     assert "feature 2 (w0): height_m is missing" in messages[1]
     assert "4 more invalid features" in messages[-1]
+
+
+def test_number_of_holes_has_a_limit(tmp_path, monkeypatch):
+    """The time to triangulate a polygon grows with the square of its holes: 200,000 would take hours."""
+    holes = [[[x, 1], [x, 2], [x + 0.5, 2], [x + 0.5, 1], [x, 1]] for x in range(1, 10)]
+    walls = polygon([[0, 0], [20, 0], [20, 20], [0, 20], [0, 0]], *holes, height_m=3)
+    monkeypatch.setenv("EGVS_MAX_HOLES", "8")
+    with pytest.raises(DiagnosticsError, match=r"has 9 holes\. The limit is 8 holes; set EGVS_MAX_HOLES to raise it"):
+        build(tmp_path, walls)
+    monkeypatch.setenv("EGVS_MAX_HOLES", "9")
+    world, _ = build(tmp_path, walls)
+    assert volumes(world) == pytest.approx([3 * (400 - 9 * 0.5)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -18,6 +19,12 @@ _SYSTEM_FILES = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache", "/etc/localtime",
 """What the libraries of a system read, beside what they are asked to."""
 
 
+OUT_OF_MEMORY = re.compile(
+    r"bad_alloc|MemoryError|more memory|out ?of ?memory|cannot allocate|memory allocation", re.IGNORECASE
+)
+"""What programs write when an allocation fails, in C++, in Python, in Rust, and in the XML parser Xerces."""
+
+
 @dataclass(frozen=True)
 class Confinement:
     """What a program may do.
@@ -31,7 +38,7 @@ class Confinement:
     has_network
         Whether it may open sockets.
     memory_bytes
-        Largest address space; None: no limit.
+        Largest memory that it may allocate; None: no limit.
     processor_s
         Longest time of work, seconds; None: no limit.
     """

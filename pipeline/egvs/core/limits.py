@@ -82,6 +82,7 @@ ELEMENT = Limit("EGVS_MAX_ELEMENT_MB", 16, "MB", "one element below the root of 
 XML_ELEMENTS = Limit("EGVS_MAX_XML_ELEMENTS", 10_000_000, "elements", "an XML file")
 POINTS = Limit("EGVS_MAX_POINTS", 30_000_000, "points", "a point cloud")
 TRIANGLES = Limit("EGVS_MAX_TRIANGLES", 5_000_000, "triangles", "a mesh")
+HOLES = Limit("EGVS_MAX_HOLES", 5000, "holes", "one polygon: the time to triangulate it grows with their square")
 SITES = Limit("EGVS_MAX_SITES", 100_000, "candidates", "a scenario's sites")
 BEAMS = Limit("EGVS_MAX_BEAMS", 3_000_000, "beams", "one turn of a sensor")
 VOXELS = Limit("EGVS_MAX_VOXELS", 2**30, "voxels", "a region of interest")
@@ -91,6 +92,13 @@ MAP_OBJECTS = Limit("EGVS_MAX_MAP_OBJECTS", 5_000_000, "objects", "an OpenStreet
 GROUND_POINTS = Limit("EGVS_MAX_GROUND_POINTS", 2_000_000, "points", "the ground surface built from a network")
 DOWNLOAD = Limit("EGVS_MAX_DOWNLOAD_MB", 200, "MB", "a downloaded map")
 DOWNLOAD_TIME = Limit("EGVS_MAX_DOWNLOAD_S", 120, "s", "the download of a map")
+VEHICLES = Limit("EGVS_MAX_VEHICLES", 1_000_000, "vehicles", "the vehicles and people that route files let depart")
+ROUTE_EDGES = Limit("EGVS_MAX_ROUTE_EDGES", 1_000_000, "edges", "one route of a route file, with its repetitions")
+SUMO_MEMORY = Limit("EGVS_MAX_SUMO_MB", 2000, "MB", "a program of SUMO, beside 20 MB for each MB of its input")
+SUMO_TIME = Limit(
+    "EGVS_MAX_SUMO_S", 600, "s", "work of such a program, beside 10 s for each MB of its input and 1 s for a time step"
+)
+SUMO_IDLE = Limit("EGVS_MAX_SUMO_IDLE_S", 600, "s", "waiting for such a program, while it neither works nor writes")
 READER_MEMORY = Limit("EGVS_MAX_READER_MB", 2000, "MB", "a process that reads a file with another library")
 READER_TIME = Limit("EGVS_MAX_READER_S", 120, "s", "work of such a process, beside 1 s for each MB of the file")
 

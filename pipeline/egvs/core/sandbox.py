@@ -82,12 +82,16 @@ def main(arguments: list[str]) -> int:
 
 
 def limit_resources(memory_bytes: list[str], processor_s: list[str]) -> None:
-    """Let allocations above a limit fail, and let the kernel end the process (SIGXCPU) after so much processor time."""
+    """Let allocations above a limit fail, and let the kernel end the process (SIGXCPU) after so much processor time.
+
+    RLIMIT_DATA counts what a process can write to, unlike RLIMIT_AS: neither the code of libraries nor reserved
+    addresses, which take 0.5 GB in SUMO.
+    """
     try:
         import resource
     except ImportError:  # Windows
         return
-    for kind, values in ((resource.RLIMIT_AS, memory_bytes), (resource.RLIMIT_CPU, processor_s)):
+    for kind, values in ((resource.RLIMIT_DATA, memory_bytes), (resource.RLIMIT_CPU, processor_s)):
         for value in values:
             hard = resource.getrlimit(kind)[1]
             soft = int(value) if hard == resource.RLIM_INFINITY else min(hard, int(value))

@@ -1,4 +1,4 @@
-"""Read columns of a Parquet file in a process of its own.
+"""Read a GeoParquet file in a process of its own.
 
 A few bytes of such a file may stand for gigabytes: values that repeat, and sizes that are not true. The other process
 (:mod:`egvs.formats.reader_process`) has a limit of memory.
@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-import sys
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,20 +41,9 @@ class ParquetHeader:
     metadata: dict[str, str]
 
 
-def read_header(path: Path, doing: str) -> ParquetHeader:
-    """Return the header of a file; InputError, with ``doing`` for what failed, when it is damaged."""
-    blocks = _blocks(path, doing, None)
-    try:
-        values = json.loads(bytes(next(blocks).content))
-    except StopIteration:
-        raise InputError(path, doing, COMPLETE_FILE) from None
-    finally:
-        blocks.close()
-    return ParquetHeader(tuple(values["columns"]), values["metadata"])
-
-
-def read_batches(path: Path, doing: str, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of a file in batches.
+@contextmanager
+def open_parquet(path: Path, doing: str) -> Iterator[tuple[ParquetHeader, Iterator[pa.RecordBatch]]]:
+    """Start to read a GeoParquet file.
 
     Parameters
     ----------
@@ -63,19 +51,35 @@ def read_batches(path: Path, doing: str, columns: Sequence[str]) -> Iterator[pa.
         The file.
     doing
         What failed, for messages, e.g. "cannot be read as Parquet".
-    columns
-        Names of the columns to read, all of which exist.
+
+    Yields
+    ------
+    ParquetHeader
+        What the file says of its content.
+    iterator of pyarrow.RecordBatch
+        Its rows, without the columns that repeat the bounds of each geometry.
 
     Raises
     ------
     InputError
         When the file is damaged, a text is not UTF-8, or it needs too much memory or time.
     """
+    limits.checked_size(path, limits.FILE)
+    blocks = read_blocks(__name__, path, os.fspath(path), doing)
+    try:
+        header = next(blocks, None)
+        if header is None:
+            raise InputError(path, doing, COMPLETE_FILE)
+        values = json.loads(bytes(header.content))
+        yield ParquetHeader(tuple(values["columns"]), values["metadata"]), _batches(blocks, path, doing)
+    finally:
+        blocks.close()
+
+
+def _batches(blocks: Iterator[Block], path: Path, doing: str) -> Iterator[pa.RecordBatch]:
     import pyarrow as pa
 
-    blocks = _blocks(path, doing, columns)
     try:
-        next(blocks, None)  # the header
         for block in blocks:
             with pa.ipc.open_stream(block.content) as stream:
                 for batch in stream:
@@ -83,8 +87,6 @@ def read_batches(path: Path, doing: str, columns: Sequence[str]) -> Iterator[pa.
                     yield batch
     except (pa.ArrowException, UnicodeDecodeError) as error:
         raise InputError(path, f"{doing} ({error})", COMPLETE_FILE) from None
-    finally:
-        blocks.close()
 
 
 def decoded_bytes(batch: pa.RecordBatch) -> int:
@@ -104,32 +106,35 @@ def decoded_bytes(batch: pa.RecordBatch) -> int:
     return size
 
 
-def _blocks(path: Path, doing: str, columns: Sequence[str] | None) -> Generator[Block, None, None]:
-    limits.checked_size(path, limits.FILE)
-    arguments = [json.dumps(None if columns is None else list(columns))]
-    return read_blocks(__name__, path, os.fspath(path), doing, arguments)
-
-
 # --- in the other process ---
 
 
 def _read_file(path: Path) -> Iterator[Block]:
     import pyarrow.parquet as pq
 
-    columns = json.loads(sys.argv[2])
     with pq.ParquetFile(path, pre_buffer=False) as file:
-        yield _header_block(file.schema_arrow.names, file.metadata.metadata)
-        if columns is not None:
-            for batch in file.iter_batches(_BATCH_ROWS, columns=columns, use_threads=False):
-                yield _batch_block(batch.select(columns))
+        texts = {}
+        for key, value in (file.metadata.metadata or {}).items():
+            with suppress(UnicodeDecodeError):
+                texts[key.decode()] = value.decode()
+        names = file.schema_arrow.names
+        yield Block({}, json.dumps({"columns": names, "metadata": texts}).encode())
+        coverings = _covering_columns(texts.get("geo", ""))
+        columns = [name for name in names if name not in coverings]
+        for batch in file.iter_batches(_BATCH_ROWS, columns=columns, use_threads=False):
+            yield _batch_block(batch.select(columns))
 
 
-def _header_block(columns: list[str], metadata: dict[bytes, bytes] | None) -> Block:
-    texts = {}
-    for key, value in (metadata or {}).items():
-        with suppress(UnicodeDecodeError):
-            texts[key.decode()] = value.decode()
-    return Block({}, json.dumps({"columns": columns, "metadata": texts}).encode())
+def _covering_columns(geo: str) -> set[str]:
+    """Return the names of the columns that repeat the bounds of each geometry; none where the metadata are damaged.
+
+    Source: GeoParquet 1.1, "covering": {"bbox": {"xmin": [column, "xmin"], ...}}.
+    """
+    try:
+        columns = json.loads(geo)["columns"].values()
+        return {path[0] for column in columns for path in column.get("covering", {}).get("bbox", {}).values()}
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError):
+        return set()
 
 
 def _batch_block(batch: pa.RecordBatch) -> Block:

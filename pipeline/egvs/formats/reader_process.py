@@ -26,7 +26,7 @@ from typing import IO, Any
 import numpy as np
 
 from egvs.core import files, limits, sandbox
-from egvs.core.child_process import Confinement, python_files, start_program
+from egvs.core.child_process import OUT_OF_MEMORY, Confinement, python_files, start_program
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE, describe_exception
@@ -36,6 +36,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 _MAX_LINE = 1_000_000
 _MAX_MESSAGE = 100_000
+_LAST_LINES = 3
 _VARIABLES = ("LANG", "LC_ALL", "LC_CTYPE", "LD_LIBRARY_PATH", "PATH", "PYTHONUTF8", "SYSTEMROOT", "TZ")
 """Environment variables that a reader gets; those of GDAL, PROJ and other libraries can name files and servers."""
 _VARIABLE_PREFIXES = ("EGVS_", "OPENBLAS_")
@@ -163,6 +164,8 @@ def read_blocks(
     if code == sandbox.CANNOT_START:
         reason = messages[-1] if messages else "the process that started it has ended"
         raise MissingBackendError(f"{sys.executable} cannot be started: {reason}")
+    if code and OUT_OF_MEMORY.search("\n".join(messages[-_LAST_LINES:])):
+        raise InputError(where, f"{doing} (its reader needed too much memory)", limits.READER_MEMORY.hint)
     if code:
         raise InputError(where, f"{doing} ({messages[-1] if messages else 'its reader failed'})", COMPLETE_FILE)
 

@@ -128,13 +128,19 @@ def _check_shapefile_complete(path: Path) -> None:
 def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
     """Return the table of a GeoParquet file, the name of its geometry column, and its reference system."""
     doing = "the file cannot be read as GeoParquet"
-    header = parquet_process.read_header(path, doing)
+    with parquet_process.open_parquet(path, doing) as (header, batches):
+        name, crs = _geometry_column(path, header, doing)
+        return _bounded_table(path, batches), name, crs
+
+
+def _geometry_column(path: Path, header: parquet_process.ParquetHeader, doing: str) -> tuple[str, str | None]:
+    """Return the geometry column of a GeoParquet file, and its reference system."""
     try:
         geo = json.loads(header.metadata["geo"])
         name = geo["primary_column"]
         column = geo["columns"][name]
         encoding = column["encoding"]
-        covering = column.get("covering", {}).get("bbox", {}).get("xmin", [None])[0]
+        crs = column.get("crs", "OGC:CRS84")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(path, f"{doing} ({error!r})"[:200], _EXPORT_HINT) from None
     if encoding != "WKB" or name not in header.columns:
@@ -143,16 +149,14 @@ def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
     duplicates = sorted({column for column in header.columns if header.columns.count(column) > 1})
     if duplicates:
         raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Use each column name once.")
-    table = _bounded_table(path, doing, [column for column in header.columns if column != covering])
-    crs = column.get("crs", "OGC:CRS84")
-    return table, name, json.dumps(crs) if isinstance(crs, dict) else crs
+    return name, json.dumps(crs) if isinstance(crs, dict) else crs
 
 
-def _bounded_table(path: Path, doing: str, columns: list[str]) -> pa.Table:
-    """Return columns of a file that is small enough to be held as features."""
+def _bounded_table(path: Path, rows: Iterator[pa.RecordBatch]) -> pa.Table:
+    """Return the rows of a file that is small enough to be held as features."""
     batches = []
     size = 0
-    for batch in parquet_process.read_batches(path, doing, columns):
+    for batch in rows:
         size += parquet_process.decoded_bytes(batch) + FEATURE_BYTES * batch.num_rows
         limits.DOCUMENT.check_bytes(path, size, f"has more than {limits.DOCUMENT.maximum} MB as GeoJSON")
         batches.append(batch)

@@ -57,14 +57,18 @@ def check_sumo_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report each file that SUMO may not read: damaged, hostile, or with references to other files."""
     if inputs.scenario.traffic.is_finished:
         return
+    scenario = inputs.scenario
     try:
-        paths = sumo_folder.demand_files(inputs.scenario).all()
+        demand = sumo_folder.demand_files(scenario)
+        timing = sumo_folder.make_timing(scenario.traffic, demand.begin_s, sumo_folder.traffic_location(scenario))
     except InputError:
         return  # check_times reports it
     errors = ErrorCollector()
-    for path in paths:
+    for path in demand.all():
         if path.is_file() and not network.is_osm(path):
             errors.attempt("traffic", partial(user_files.check_copyable, path))
+    if not errors.findings:
+        errors.attempt("traffic", partial(user_files.check_demand_size, demand, *timing.simulated_s))
     yield from errors.findings
 
 

@@ -232,7 +232,7 @@ def run_sumo(
         "duration-log.disable": "true",
         **options,
     }
-    sumo.run_program("sumo", sumo_folder.as_flags(all_options), folder)
+    sumo.run_program("sumo", sumo_folder.as_flags(all_options), folder, time_steps=round(duration_s / STEP_S))
     (vehicles,) = (e for e in xml.iter_elements(folder / _STATISTICS_FILE, "statistics") if e.tag == "vehicles")
     return _standing(folder / _FCD_FILE), int(vehicles.get("waiting", 0))
 

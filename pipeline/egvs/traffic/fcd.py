@@ -15,10 +15,10 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Generator, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from egvs.core import limits, reading
 from egvs.core.errors import InputError
 from egvs.core.wording import number_of
-from egvs.formats import xml
+from egvs.formats import arrow_bounds, xml
 from egvs.formats.georeference import WGS84, WORLD, CoordinateReading, Georeference, look_like_degrees
 from egvs.scenario.fields import MAX_COORDINATE_M
 
@@ -172,28 +172,32 @@ def _read_csv(path: Path, element: str) -> Iterator[pa.RecordBatch]:
 
 
 def _read_parquet(path: Path, element: str) -> Iterator[pa.RecordBatch]:
-    with _open_parquet(path) as file:
-        columns = _source_columns(file.schema_arrow.names, path, element)
-        _check_rows(file.metadata, path)
-        for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
-            batch.validate(full=True)  # texts must be UTF-8
-            yield batch.select(list(columns.values())).rename_columns(list(columns))
-
-
-@contextmanager
-def _open_parquet(path: Path) -> Iterator[Any]:
     import pyarrow.parquet as pq
 
-    with (
-        reading.translate_errors(path, _COMPLETE_FILE, "cannot be read as Parquet"),
-        _open_seekable(path) as source,
-        pq.ParquetFile(source) as file,
-    ):
-        yield file
+    with _translate_parquet_errors(path), _open_seekable(path) as source:
+        with pq.ParquetFile(source) as file:
+            columns = _source_columns(file.schema_arrow.names, path, element)
+            _check_rows(file.metadata, path)
+            largest = max(arrow_bounds.parquet_group_bytes(file, source, list(columns.values()), path), default=0)
+            problem = f"has a row group of {largest / limits.MB:,.0f} MB after decompression"
+            limits.UNPACKED.check_bytes(path, largest, problem)
+        # Texts stay encoded until their length is checked: a long one may occur in each row.
+        with pq.ParquetFile(source, read_dictionary=[columns[name] for name in _STRINGS]) as file:
+            for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
+                batch.validate(full=True)  # texts must be UTF-8
+                batch = batch.select(list(columns.values())).rename_columns(list(columns))
+                for name in _STRINGS:
+                    texts = arrow_bounds.decode_texts(batch.column(name), f"{path}: {name}")
+                    batch = batch.set_column(batch.schema.get_field_index(name), name, texts)
+                yield batch
+
+
+def _translate_parquet_errors(path: Path) -> AbstractContextManager[None]:
+    return reading.translate_errors(path, _COMPLETE_FILE, "cannot be read as Parquet")
 
 
 @contextmanager
-def _open_seekable(path: Path) -> Iterator[Any]:
+def _open_seekable(path: Path) -> Iterator[Path | IO[bytes]]:
     """Unzip a gzipped file first, since Parquet is read from its end."""
     if xml.is_gzip(path):
         with xml.open_bounded(path) as file, tempfile.TemporaryFile() as plain:
@@ -209,7 +213,9 @@ def fcd_metadata(path: Path) -> bytes | None:
     with xml.open_bounded(path) as file:
         if not file.read(4).startswith(b"PAR1"):
             return None
-    with _open_parquet(path) as parquet:
+    import pyarrow.parquet as pq
+
+    with _translate_parquet_errors(path), _open_seekable(path) as source, pq.ParquetFile(source) as parquet:
         values: dict[bytes, bytes] = parquet.metadata.metadata or {}
         return values.get(b"egvs")
 
@@ -217,8 +223,6 @@ def fcd_metadata(path: Path) -> bytes | None:
 def _check_rows(metadata: Any, path: Path) -> None:
     """Raise an InputError if a Parquet file declares more rows than it can contain."""
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    largest = max((group.total_byte_size for group in groups), default=0)
-    limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB after decompression")
     packed = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
     if metadata.num_rows > _MAX_ROWS_PER_BYTE * packed:
         raise InputError(path, f"declares {metadata.num_rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)

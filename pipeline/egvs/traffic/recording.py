@@ -535,7 +535,8 @@ def simulate(
 
     start = perf_counter()
     flags = ["-c", sumo_folder.CONFIG_FILE, *sumo_folder.as_flags(prepared.outputs)]
-    sumo.run_program("sumo", flags, prepared.folder, prepared.folder / sumo_folder.LOG_FILE, watch)
+    steps = (timing.end_ms - timing.begin_ms) // timing.step_ms
+    sumo.run_program("sumo", flags, prepared.folder, prepared.folder / sumo_folder.LOG_FILE, watch, steps)
     check_complete(prepared)
     if region_watch is not None:
         region_watch.finish()

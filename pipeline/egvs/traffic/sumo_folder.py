@@ -78,6 +78,11 @@ class Timing:
         """End of the simulation: the step after the last frame."""
         return self.first_ms + (self.frames - 1) * self.period_ms + self.step_ms
 
+    @property
+    def simulated_s(self) -> tuple[float, float]:
+        """Begin and end of the simulation in seconds."""
+        return self.begin_ms / 1000.0, self.end_ms / 1000.0
+
     def window(self) -> FrameWindow:
         """Return the recorded frames; SUMO records every one."""
         return FrameWindow(self.frames, self.period_ms, self.first_ms, complete=True)
@@ -324,7 +329,8 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
     where = traffic_location(scenario)
     inputs = demand_files(scenario)
     timing = make_timing(traffic, inputs.begin_s, where)
-    times_s = timing.begin_ms / 1000.0, timing.end_ms / 1000.0
+    times_s = timing.simulated_s
+    user_files.check_demand_size(inputs, *times_s)
     adding = [extension for extension in extensions if extension.ADDS_TRAFFIC]
     extra_files = [EXTRA_ROUTES_FILE.replace("others", f"others{number or ''}") for number in range(len(adding))]
 

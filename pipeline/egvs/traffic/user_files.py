@@ -14,6 +14,7 @@ routes may depend on them.
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shutil
@@ -26,7 +27,7 @@ from typing import IO
 from xml.etree.ElementTree import Element, tostring
 from xml.sax.saxutils import quoteattr
 
-from egvs.core import files
+from egvs.core import files, limits
 from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan
@@ -37,6 +38,14 @@ DEMAND_OPTIONS = ("route-files", "additional-files")
 
 _DEMAND_ELEMENTS = frozenset({"vehicle", "trip", "flow", "include"})
 
+
+_FLOW_ELEMENTS = frozenset({"flow", "personFlow", "containerFlow"})
+_FLOW_RATES = {
+    "vehsPerHour": 3600.0, "perHour": 3600.0, "personsPerHour": 3600.0, "containersPerHour": 3600.0, "probability": 1.0,
+}  # fmt: skip
+"""Attributes of flows with a number of departures, and the seconds in which so many depart."""
+_DEPARTING_ELEMENTS = _FLOW_ELEMENTS | {"vehicle", "trip", "person", "container"}
+_RANDOM_PERIOD = re.compile(r"exp\((.*)\)")
 
 _SYNONYMS = {
     "n": "net-file", "net": "net-file", "r": "route-files", "route": "route-files", "routes": "route-files",
@@ -242,6 +251,85 @@ def _parse_begin_s(value: str, path: Path) -> float:
     if not 0.0 <= seconds <= _MAX_BEGIN_S:
         problem = f"expected 0 to {_MAX_BEGIN_S:g} seconds"
         raise InputError(f"{path}: begin = {value[:80]!r}", problem, "Use 25200, for example, for seven o'clock.")
+    return seconds
+
+
+def check_demand_size(inputs: DemandFiles, begin_s: float, end_s: float) -> None:
+    """Raise an InputError for demand that SUMO would need too much memory for.
+
+    Parameters
+    ----------
+    inputs
+        The inputs of the simulation.
+    begin_s, end_s
+        The simulated time; what departs at other times does not count.
+
+    Raises
+    ------
+    InputError
+        When more vehicles and people depart than :data:`egvs.core.limits.VEHICLES`, or a route has more edges than
+        :data:`egvs.core.limits.ROUTE_EDGES`.
+    """
+    scale = number_or_nan(inputs.options.get("scale", "1"))
+    departures = 0.0
+    for path in [path for option in DEMAND_OPTIONS for path in inputs.files.get(option, ())]:
+        departures += _count_departures(path, hash_input(path), begin_s, end_s)
+        scaled = departures * scale if scale > 0.0 else departures
+        actual = f"{scaled:,.0f} vehicles and people depart in {end_s - begin_s:,.0f} s"
+        limits.VEHICLES.check(path, scaled, actual)
+
+
+@lru_cache(maxsize=32)
+def _count_departures(path: Path, _content: str, begin_s: float, end_s: float) -> float:
+    """Return how many vehicles and people depart in a time; cached, for the check and the simulation.
+
+    InputError when a route is too long.
+    """
+    departures = 0.0
+    for child in xml.iter_elements(path, ""):
+        for element in child.iter():
+            if element.tag in _FLOW_ELEMENTS:
+                departures += _flow_departures(element, begin_s, end_s)
+            elif element.tag in _DEPARTING_ELEMENTS:
+                departures += not parse_clock_s(element.get("depart", "")) > end_s
+            elif element.tag == "route" and element.get("repeat"):
+                repeated = number_or_nan(element.get("repeat", ""))
+                edges = (repeated + 1.0) * len(element.get("edges", "").split())
+                if edges > limits.ROUTE_EDGES.maximum:
+                    where = f"{path}: route {element.get('id', '')}".rstrip()
+                    limits.ROUTE_EDGES.check(where, edges, f"has {edges:,.0f} edges with repeat={repeated:g}")
+    return departures
+
+
+def _flow_departures(flow: Element, begin_s: float, end_s: float) -> float:
+    """Return how many vehicles of a flow depart in a time; 0 for invalid numbers, which SUMO describes better.
+
+    Source: https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_Types,_and_Routes.html#repeated_vehicles_flows.
+    """
+    first_s, last_s = (parse_clock_s(flow.get(key, "")) for key in ("begin", "end"))
+    first_s, last_s = (begin_s if math.isnan(first_s) else first_s), (end_s if math.isnan(last_s) else last_s)
+    simulated_s = min(last_s, end_s) - max(first_s, begin_s)
+    if not simulated_s > 0.0:
+        return 0.0
+    number = number_or_nan(flow.get("number", ""))
+    rates = [number_or_nan(flow.get(key, "")) / seconds for key, seconds in _FLOW_RATES.items()]
+    period = flow.get("period", "")
+    if random_period := _RANDOM_PERIOD.fullmatch(period):
+        rates.append(number_or_nan(random_period[1]))
+    elif number_or_nan(period) > 0.0:
+        rates.append(1.0 / number_or_nan(period))
+    rates = [rate for rate in rates if rate > 0.0]
+    if rates:
+        departures = max(rates) * simulated_s
+        return min(departures, number) if number > 0.0 else departures
+    return number * simulated_s / (last_s - first_s) if number > 0.0 else 0.0
+
+
+def parse_clock_s(text: str) -> float:
+    """Parse a time of SUMO, in seconds or as ``[days:]hours:minutes:seconds``; NaN for any other text."""
+    seconds = 0.0
+    for part, unit_s in zip(reversed(text.split(":")), (1.0, 60.0, 3600.0, 86400.0), strict=False):
+        seconds += number_or_nan(part) * unit_s
     return seconds
 
 

@@ -173,6 +173,7 @@ class _Collector:
             return
 
         _check_coordinates(np.concatenate([ring for surface in rings for ring in surface]), where)
+        limits.HOLES.check(where, max(len(surface) - 1 for surface in rings))
         placed = _Placed(rings, system)
         if not outside.is_in_window(placed, where):
             self.counts.drop(kind, OUT_OF_RANGE)

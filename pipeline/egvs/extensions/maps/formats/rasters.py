@@ -169,6 +169,7 @@ def read_ascii_grid(path: Path) -> HeightGrid:
     InputError
         When the file is damaged or too large.
     """
+    limits.checked_size(path, limits.FILE)
     with xml.open_bounded(path) as file, translate_errors(path):
         header, first_row = _read_ascii_header(file, path)
         rows, columns = int(header["nrows"]), int(header["ncols"])

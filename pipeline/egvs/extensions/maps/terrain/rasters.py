@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import by_number, format_percent, number_of
@@ -109,7 +108,6 @@ def _grid_notes(grids: Sequence[tuple[HeightGrid, str]], context: MapContext) ->
 
 
 def _read_grid(path: Path, context: MapContext) -> HeightGrid:
-    limits.checked_size(path, limits.FILE)
     with xml.open_bounded(path) as file:
         head = file.read(512)
     if rasters.is_ascii_grid(head):

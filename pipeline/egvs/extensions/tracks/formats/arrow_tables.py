@@ -11,6 +11,7 @@ import numpy as np
 from egvs.core import limits, reading
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.formats import arrow_bounds
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -81,7 +82,12 @@ class ArrowTable:
 
     def texts(self, name: str) -> list[str]:
         """Return a column of texts; InputError for a missing one."""
+        import pyarrow as pa
+
         column = self._column(name)
+        kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
+        if not (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+            raise InputError(f"{self.path}: {name}", f"expected texts, got values of type {kind}", _HINT)
         result: list[str] = []
         with reading.translate_errors(self.path, _HINT, f"{name} cannot be read"):
             for chunk in column.chunks:
@@ -123,8 +129,8 @@ def _parquet_batches(
     with pq.ParquetFile(path, read_dictionary=list(texts)) as file:
         selected = _select(path, file.schema_arrow.names, names, optional)
         limits.ROWS.check(path, file.metadata.num_rows)
-        groups = (file.metadata.row_group(index) for index in range(file.metadata.num_row_groups))
-        limits.UNPACKED.check_bytes(path, sum(group.total_byte_size for group in groups))
+        size = sum(arrow_bounds.parquet_group_bytes(file, path, selected, path))
+        limits.UNPACKED.check_bytes(path, size, f"has {size / limits.MB:,.0f} MB after decompression")
         for batch in file.iter_batches(columns=selected, use_threads=False):
             batch.validate(full=True)
             yield batch
@@ -139,6 +145,9 @@ def _feather_batches(
         with pa.ipc.open_file(source) as file:
             actual = file.schema.names
         selected = _select(path, actual, names, optional)
+        with path.open("rb") as content:
+            size = arrow_bounds.feather_bytes(content, path)
+        limits.UNPACKED.check_bytes(path, size, f"has {size / limits.MB:,.0f} MB after decompression")
         options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=[actual.index(name) for name in selected])
         source.seek(0)
         file = pa.ipc.open_file(source, options=options)
