@@ -263,19 +263,39 @@ def test_warns_of_sensors_high_above_the_road(street: Path) -> None:
 @pytest.mark.parametrize(
     "solids",
     [
-        [house(12.0, north_m=20.0)],  # on a hillside 15 m behind the kerb
-        [house(-9.0, north_m=20.0)],  # down a hillside
+        [house(-5.0, north_m=20.0)],  # down a hillside
+        [house(12.0, north_m=20.0), house(0.0), house(0.0, north_m=14.0)],
         [box((-20, -10), (60, 10), name="deck", kind="bridge", base_m=5, height_m=6)],
         [box((-20, -10), (60, 10), name="deck", kind="footprint", base_m=22, height_m=24)],
         [box((10, -10), (20, 10), name="over", kind="building", base_m=6, height_m=12)],
         [box((10, 6), (20, 10), name="canopy", kind="footprint", base_m=8, height_m=8.4)],
-        [house(0.0, 30.0), house(30.0, 88.0, name="tower")],
+        [house(0.0, 30.0), house(30.0, 88.0, name="tower"), house(118.0, 2.0, name="roof")],
         [house(0.0, 9.0, north_m=8), house(0.0, 7.0, north_m=14)],
     ],
 )  # fmt: skip
 def test_valid_solids_have_no_finding(street: Path, solids: list[dict]) -> None:
     statics(street, *solids)
     assert heights(street) == []
+
+
+@pytest.mark.parametrize("foot_m", [12.0, -9.0])
+def test_hillside_15_metres_behind_the_kerb_is_no_error(street: Path, foot_m: float) -> None:
+    statics(street, house(foot_m, north_m=20.0))
+    (told,) = heights(street)
+    assert told.startswith("[")
+
+
+@pytest.mark.parametrize(("offset_m", "side"), [(20.0, "above"), (-35.0, "below")])
+def test_common_offset_of_solids_at_several_distances_is_an_error(street: Path, offset_m: float, side: str) -> None:
+    """A slope explains the offset of the farthest alone, but not that all have the same one."""
+    rows = [house(offset_m, north_m=8.0 + 7.0 * number, name=f"h{number}") for number in range(6)]
+    statics(street, *rows)
+    (told,) = heights(street)
+    assert f"6 of 6 solids near the region have their {'foot' if side == 'above' else 'roof'} " in told
+    assert f"m {side} the road beside them (median): h0, h1, h2 and 3 more" in told and not told.startswith("[")
+    slope = [house(offset_m * (number + 1) / 6, north_m=8.0 + 7.0 * number, name=f"h{number}") for number in range(6)]
+    statics(street, *slope)
+    assert [line for line in heights(street) if not line.startswith("[")] == []
 
 
 def test_houses_below_an_elevated_road_are_valid(street: Path) -> None:

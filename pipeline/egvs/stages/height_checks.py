@@ -6,7 +6,8 @@ compared with those of the road beside them (of the traffic, where there is no n
 - A solid floats if its foot is higher above the road than a slope of :data:`MAX_SLOPE` explains and above all sensors,
   and no other solid carries it. It is buried if its roof is lower below the road than such a slope explains. Solids
   over lanes, bridges and crowns float only above :data:`MAX_ELEVATED_M`, other thin solids above :data:`MAX_BESIDE_M`.
-- If most solids of a file float or are buried, its zero is another one, which is an error; single ones are a warning.
+- Solids with the same offset as those count, too. If they are most of those that stand on the ground, the file has
+  another zero, which is an error. Single ones are a warning, and so are files most of whose solids are above the road.
 - Vehicles are compared with the lanes below them, lanes with the points of the terrain, sensors with the road.
 
 Hillside houses, decks, bridges and elevated roads are valid: a slope, another solid or the terrain explains them.
@@ -202,28 +203,45 @@ def _check_source(
     distance_m, low_m, high_m = reference.beside(boxes)
     allowed_m = MAX_SLOPE * distance_m + MARGIN_M
     foot_m, roof_m = extents.low_m[solids, 2], extents.high_m[solids, 2]
-    above_m = foot_m - high_m
-    sensors_m = max((site.pose.z_m for site in inputs.sites), default=-np.inf)
+    above_m, below_m = foot_m - high_m, low_m - roof_m
     overhead_m = _overhead_heights_m(inputs, extents, solids, boxes)
-    floats = above_m > np.maximum(allowed_m, overhead_m)
-    floats &= (foot_m > sensors_m) | (above_m > allowed_m + MAX_ELEVATED_M)
     is_carried = extents.carried(solids)
-    floats &= ~is_carried
-    below_m = low_m - roof_m
+    stands = (overhead_m == 0) & ~is_carried
+    sensors_m = max((site.pose.z_m for site in inputs.sites), default=-np.inf)
+    hides_nothing = (foot_m > sensors_m) | (above_m > allowed_m + MAX_ELEVATED_M)
+
+    floats = ~is_carried & (above_m > np.maximum(allowed_m, overhead_m)) & hides_nothing
+    floats |= stands & _has_offset_of(floats, above_m)
     is_buried = below_m > allowed_m
+    is_buried |= stands & (below_m > 0) & _has_offset_of(is_buried, low_m - foot_m)
+    is_high, is_low = stands & (above_m > MARGIN_M), stands & (below_m > 0)
     if inputs.scenario.statics.terrain is not None:  # the ground is known: cliffs, and roads on bridges
-        for number in np.flatnonzero(floats | is_buried):
+        for number in np.flatnonzero(floats | is_buried | is_high | is_low):
             ground_m = _ground_below_m(inputs.world, boxes[number])
-            floats[number] &= foot_m[number] > ground_m + MARGIN_M
-            is_buried[number] &= roof_m[number] < ground_m
-    judged = (overhead_m == 0) & ~is_carried | floats | is_buried
+            is_above, is_below = foot_m[number] > ground_m + MARGIN_M, roof_m[number] < ground_m
+            floats[number] &= is_above
+            is_high[number] &= is_above
+            is_buried[number] &= is_below
+            is_low[number] &= is_below
+    total = int((stands | floats | is_buried).sum())
     names = [inputs.world.solids[solid][0] for solid in solids]
-    for is_off, offset_m, part, side in (
-        (floats, above_m, "foot", "above"),
-        (is_buried, below_m, "roof", "below"),
+    for is_off, is_doubtful, offset_m, side in (
+        (floats, is_high, above_m, "above"),
+        (is_buried, is_low, below_m, "below"),
     ):
         if is_off.any():
-            yield _solid_diagnostic(source, reference, is_off, judged, offset_m, names, part, side)
+            is_error = 2 * int(is_off.sum()) > total
+            yield _solid_diagnostic(source, reference, is_off, total, offset_m, names, side, is_error=is_error)
+        elif 2 * int(is_doubtful.sum()) > total:
+            yield _solid_diagnostic(source, reference, is_doubtful, total, offset_m, names, side, is_error=False)
+
+
+def _has_offset_of(is_off: NDArray[np.bool_], offset_m: FloatArray) -> NDArray[np.bool_]:
+    """Return which solids have the same offset as those that no slope explains: a slope would depend on distance."""
+    if not is_off.any():
+        return is_off
+    is_same: NDArray[np.bool_] = np.abs(offset_m - np.median(offset_m[is_off])) <= MARGIN_M
+    return is_same
 
 
 def _overhead_heights_m(
@@ -248,21 +266,21 @@ def _solid_diagnostic(
     source: SolidSource,
     reference: Reference,
     is_off: NDArray[np.bool_],
-    judged: NDArray[np.bool_],
+    total: int,
     offset_m: FloatArray,
     names: list[str],
-    part: str,
     side: str,
+    *,
+    is_error: bool,
 ) -> Diagnostic:
-    """Return the finding on solids of a file that float or are buried: an error if they are most of those judged."""
-    count, total = int(is_off.sum()), int(judged.sum())
+    """Return the finding on solids of a file that are higher or lower than the road beside them."""
+    count = int(is_off.sum())
     median_m = float(np.median(offset_m[is_off]))
-    is_error = 2 * count > total
+    part, change_m = ("foot", -median_m) if side == "above" else ("roof", median_m)
     listed = list_first([names[number] for number in np.flatnonzero(is_off)], _MAX_LISTED)
     verb = f"{by_number(count, 'has its', 'have their')} {part} {median_m:,.1f} m {side} {reference.name} beside"
     pronoun = by_number(count, "it", "them (median)")
     problem = f"{count} of {number_of(total, 'solid')} near the region {verb} {pronoun}: {listed}"
-    change_m = -median_m if side == "above" else median_m
     return Diagnostic(RULE, source.where, problem, source.zero_hint(change_m), is_error=is_error)
 
 

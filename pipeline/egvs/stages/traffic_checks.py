@@ -256,7 +256,8 @@ def _recorded_positions_m(scenario: Scenario) -> FloatArray:
 def _is_near_region(positions_m: FloatArray, box: Roi) -> NDArray[np.bool_]:
     low_m = np.asarray(box.origin_m[:2]) - clearances.ROI_MARGIN_M
     high_m = np.add(box.origin_m, box.size_m)[:2] + clearances.ROI_MARGIN_M
-    is_near: NDArray[np.bool_] = ((positions_m[:, :2] >= low_m) & (positions_m[:, :2] <= high_m)).all(axis=1)
+    is_inside = (positions_m[:, :2] >= low_m) & (positions_m[:, :2] <= high_m)
+    is_near: NDArray[np.bool_] = np.all(is_inside, axis=1)
     return is_near
 
 

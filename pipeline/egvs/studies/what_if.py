@@ -494,7 +494,7 @@ def _check_tree_heights(document: Mapping[str, Any], scenario: Scenario, key: st
         return
     for feature in document["features"]:
         properties = feature.get("properties") if isinstance(feature, dict) else None
-        if _is_tree(properties) and properties.get(Z_DATUM) == WORLD_DATUM:
+        if isinstance(properties, dict) and _is_tree(properties) and properties.get(Z_DATUM) == WORLD_DATUM:
             problem = f"expected trees with heights above the ground, got z of the world frame ({Z_DATUM} = 'world')"
             raise InputError(f"{scenario.file}: {key}", problem, "Use the footprints that were not exported.")
 
