@@ -9,6 +9,7 @@ import gzip
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -19,7 +20,7 @@ import egvs
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.reading import read_json
-from egvs.formats import pcd, vector_files, xml
+from egvs.formats import pcd, reader_process, vector_files, xml
 from egvs.sensors import sites
 
 pytestmark = pytest.mark.system
@@ -75,6 +76,20 @@ def test_geoparquet_has_the_limit_of_geojson(tmp_path: Path, monkeypatch: pytest
         vector_files.read_gis_file(path, "Polygon")
     monkeypatch.setenv(limits.DOCUMENT.name, "50")
     assert len(vector_files.read_gis_file(path, "Polygon")["features"]) == 200_000
+
+
+def test_geoparquet_is_read_by_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = geoparquet(tmp_path / "a.parquet", 10)
+    started = []
+    start = reader_process.start_program
+
+    def count(*arguments: Any) -> Any:
+        started.append(arguments)
+        return start(*arguments)
+
+    monkeypatch.setattr(reader_process, "start_program", count)
+    assert len(vector_files.read_gis_file(path, "Polygon")["features"]) == 10
+    assert len(started) == 1
 
 
 def test_xml_has_a_limit_of_elements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

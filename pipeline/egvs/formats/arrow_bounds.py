@@ -37,10 +37,12 @@ _ENCODINGS = {0: "PLAIN", 2: "PLAIN_DICTIONARY", 3: "RLE", 4: "BIT_PACKED", 5: "
               6: "DELTA_LENGTH_BYTE_ARRAY", 8: "RLE_DICTIONARY", 9: "BYTE_STREAM_SPLIT"}  # fmt: skip
 _REPEATING = {7: "DELTA_BYTE_ARRAY"}
 """Encodings by their number; those that are read, and one in which a value repeats the one before it."""
-_UNPACKED_SIZE, _PACKED_SIZE, _DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_V2 = 2, 3, 5, 7, 8
+_KIND, _UNPACKED_SIZE, _PACKED_SIZE = 1, 2, 3
 """Fields of a PageHeader."""
-_ENCODING_FIELDS = {_DATA_PAGE: 2, _DICTIONARY_PAGE: 2, _DATA_PAGE_V2: 4}
-"""Headers of the kinds of pages, and their field with the encoding; field 1 is the number of values."""
+_DICTIONARY_PAGE = 2
+_KINDS = {0: (5, 2), _DICTIONARY_PAGE: (7, 2), 3: (8, 4)}
+"""By kind of page (data, dictionary, data of version 2): the field of its own header, and the field in it with the
+encoding; field 1 is the number of values."""
 
 
 def parquet_group_bytes(file: Any, source: Path | IO[bytes], columns: Sequence[str], where: object) -> list[int]:
@@ -172,15 +174,15 @@ class _PageReader:
             _check_parts(self._pages, self._where)
             self._file.seek(position)
             header = _read_thrift_struct(self._file)
-            kind = next((kind for kind in _ENCODING_FIELDS if kind in header), None)
             unpacked, packed = header.get(_UNPACKED_SIZE, -1), header.get(_PACKED_SIZE, -1)
             if min(unpacked, packed) < 0:
                 raise InputError(f"{self._where}: {chunk.path_in_schema}", "a page has no size", COMPLETE_FILE)
             size += unpacked
             position = self._file.tell() + packed
-            if kind is not None:
-                self._check_encoding(header[kind].get(_ENCODING_FIELDS[kind], 0), chunk)
-                values += 0 if kind == _DICTIONARY_PAGE else max(0, header[kind].get(1, 0))
+            if header.get(_KIND) in _KINDS:
+                own, encoding = _KINDS[header[_KIND]]
+                self._check_encoding(header[own].get(encoding, 0), chunk)
+                values += 0 if header[_KIND] == _DICTIONARY_PAGE else max(0, header[own].get(1, 0))
         return size
 
     def _check_encoding(self, encoding: int, chunk: Any) -> None:

@@ -308,7 +308,7 @@ def _wait(
 class _IdleWatch:
     """Ends the wait for a program that does nothing: it takes no processor time, and no file in its folder changes.
 
-    Where the system does not tell the processor time of other processes, files alone count.
+    Where the system does not tell the processor time of other processes, the wait has no limit.
 
     Parameters
     ----------
@@ -325,10 +325,13 @@ class _IdleWatch:
 
     def check(self, process: int) -> None:
         """Raise a SumoInputError if nothing has changed for too long."""
-        sizes = [entry.stat().st_size for entry in os.scandir(self._folder) if entry.is_file(follow_symlinks=False)]
-        state = (processor_seconds_of(process), len(sizes), sum(sizes))
+        busy_s = processor_seconds_of(process)
+        sizes = []
+        with suppress(FileNotFoundError):  # removed meanwhile
+            sizes = [entry.stat().st_size for entry in os.scandir(self._folder) if entry.is_file(follow_symlinks=False)]
+        state = (busy_s, len(sizes), sum(sizes))
         now_s = time.monotonic()
-        if state != self._state:
+        if state != self._state or busy_s is None:
             self._state, self._changed_s = state, now_s
         elif now_s - self._changed_s > self._limit_s:
             problem = f"{self._name} has neither worked nor written anything for {self._limit_s:,} s"

@@ -291,7 +291,8 @@ def _count_departures(path: Path, _content: str, begin_s: float, end_s: float) -
             if element.tag in _FLOW_ELEMENTS:
                 departures += _flow_departures(element, begin_s, end_s)
             elif element.tag in _DEPARTING_ELEMENTS:
-                departures += not parse_clock_s(element.get("depart", "")) > end_s
+                depart_s = _parse_clock_s(element.get("depart", ""))
+                departures += math.isnan(depart_s) or begin_s <= depart_s <= end_s
             elif element.tag == "route" and element.get("repeat"):
                 repeated = number_or_nan(element.get("repeat", ""))
                 edges = (repeated + 1.0) * len(element.get("edges", "").split())
@@ -306,7 +307,7 @@ def _flow_departures(flow: Element, begin_s: float, end_s: float) -> float:
 
     Source: https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_Types,_and_Routes.html#repeated_vehicles_flows.
     """
-    first_s, last_s = (parse_clock_s(flow.get(key, "")) for key in ("begin", "end"))
+    first_s, last_s = (_parse_clock_s(flow.get(key, "")) for key in ("begin", "end"))
     first_s, last_s = (begin_s if math.isnan(first_s) else first_s), (end_s if math.isnan(last_s) else last_s)
     simulated_s = min(last_s, end_s) - max(first_s, begin_s)
     if not simulated_s > 0.0:
@@ -325,7 +326,7 @@ def _flow_departures(flow: Element, begin_s: float, end_s: float) -> float:
     return number * simulated_s / (last_s - first_s) if number > 0.0 else 0.0
 
 
-def parse_clock_s(text: str) -> float:
+def _parse_clock_s(text: str) -> float:
     """Parse a time of SUMO, in seconds or as ``[days:]hours:minutes:seconds``; NaN for any other text."""
     seconds = 0.0
     for part, unit_s in zip(reversed(text.split(":")), (1.0, 60.0, 3600.0, 86400.0), strict=False):
