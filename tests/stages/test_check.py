@@ -95,8 +95,8 @@ def test_warns_of_site_within_junction_unless_above_road() -> None:
     """Of the hill's junction (0, -2) is in no lane, and (60, 12) is beside the road."""
     roads = Carriageway.of(network.read_net_xml(SCENARIOS / "hill" / "network.net.xml"))
     at_m = np.array([0.0, -2.0])
-    assert roads.lanes_at(at_m[None]) == [None]
     road_m = roads.height_m(roads.nearest(at_m), at_m)
+    assert roads.lanes_at(np.array([[*at_m, road_m + 2]])) == [None]
     places = {"low": (0.0, -2.0, road_m + 2), "high": (0.0, -2.0, road_m + 4.6), "beside": (60.0, 12.0, road_m + 2)}
     candidates = tuple(Site(name, Pose(*place), "VLP-32C") for name, place in places.items())
     subject = CheckInputs(egvs.load(SCENARIOS / "hill"), carriageway=roads, sites=candidates)
