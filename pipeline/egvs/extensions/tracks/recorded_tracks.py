@@ -34,6 +34,7 @@ from egvs.traffic.class_sizes import CLASS_SIZES, class_sizes
 from egvs.traffic.fcd import FCD_SCHEMA, FrameWindow
 from egvs.traffic.lane_alignment import Alignment
 from egvs.traffic.network import Network
+from egvs.traffic.road_check import MAX_SPEED_M_S
 from egvs.traffic.road_lanes import RoadLanes
 from egvs.traffic.vehicle_boxes import VehicleSize
 
@@ -316,7 +317,7 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
         yield Diagnostic("track rows", where, problem, "Check how the file was written.")
     if report.jumps:
         problem = (
-            f"tracks jump {number_of(report.jumps, 'time')}, faster than {cleaning.MAX_SPEED_M_S:g} m/s; they"
+            f"tracks jump {number_of(report.jumps, 'time')}, faster than {MAX_SPEED_M_S:g} m/s; they"
             " are cut there, because"
             " the identity has probably switched to another road user"
         )
@@ -344,8 +345,6 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
         yield Diagnostic("track gaps", where, problem, "Raise track_gap_s if straight lines are good enough.")
     if recorded.coverage is not None:
         yield from recorded.coverage.warnings(where)
-    if recorded.alignment is not None:
-        yield from recorded.alignment.warnings(where)
 
 
 def track_source(scenario: Scenario) -> TrackSource:

@@ -1,0 +1,355 @@
+"""Compare recorded vehicles with the roads: FCD files and tracks alike.
+
+Wrong coordinates, another convention of angles, a mirrored map or shared names give a complete result that is wrong.
+Four things are counted, of motor vehicles in and around the region of interest:
+
+- *off the road*: positions of moving vehicles more than :data:`BESIDE_M` beside every lane, and in no junction;
+- *against the lanes*: positions on lanes that all lead the other way. In junctions, nothing is said about directions;
+- *headings*: headings that are more than :data:`ACROSS_DEG` off the motion;
+- *shared names*: rows of one vehicle at one time in two places, and steps that no vehicle can make.
+
+A vehicle moves if it is at least :data:`MIN_MOTION_M` away after :data:`BASE_S`, and faster than :data:`MOVING_M_S`.
+Real traffic has some of each: drivers overtake, turn round, cross car parks, and roads are missing in maps. So a small
+share is nothing, a larger one is a warning, and one that no traffic has is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from egvs.core.errors import Diagnostic
+from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.wording import by_number, format_percent, number_of
+from egvs.traffic import lane_alignment
+from egvs.traffic.lane_alignment import Alignment
+from egvs.traffic.network import Network
+from egvs.traffic.road_lanes import RoadLanes
+
+AROUND_M = 50.0
+"""Vehicles farther from the region of interest than this do not count."""
+
+BASE_S, MIN_MOTION_M, MOVING_M_S = 0.5, 1.0, 1.5
+"""Over this time, and at least this distance, motion is measured; slower vehicles do not count."""
+
+MAX_BASE_S = 5.0
+"""Over longer times, a vehicle may have turned several times."""
+
+MAX_TURN_DEG = 30.0
+"""Where a heading changes by more, the motion in between says little about it."""
+
+BESIDE_M = 1.0
+"""A front that is no more than this beside a lane is on the road: drivers keep to a side, and maps are inexact."""
+
+AGAINST_DEG = 120.0
+"""A lane leads the other way if its direction is farther off the motion than this."""
+
+ACROSS_DEG = 45.0
+"""A heading that is farther off the motion than this is wrong."""
+
+MAX_SPEED_M_S, MIN_JUMP_M = 60.0, 2.0
+"""A step is a jump if it is longer than this distance and this speed allow."""
+
+WARN_SHARE = 0.1
+"""Share of positions off the road or against the lanes, or of headings off the motion, that gets a warning."""
+
+ERROR_SHARE = 0.5
+"""Share of positions off the road and against the lanes together that is an error; half is a wrong map or frame."""
+
+ERROR_AGAINST_SHARE = 0.25
+"""Share of positions against the lanes that is an error."""
+
+ERROR_HEADING_SHARE = 0.25
+"""Share of headings off the motion that is an error."""
+
+MIN_POSITIONS = 30
+"""Shares of fewer positions are only warnings."""
+
+ERROR_SHIFT_M, ERROR_SHIFT_GAIN = 3.0, 0.25
+"""A shift by at least this, which brings so many more of the positions onto lanes, is an error."""
+
+ERROR_SHARED_SHARE = 0.01
+"""Share of rows whose vehicle is in another place at the same time that is an error; of jumps, it gets a warning."""
+
+ERROR_JUMP_SHARE = 0.1
+"""Share of rows to which a vehicle jumps that is an error."""
+
+_MAX_POSITIONS = 4000
+"""Positions of each table that are compared with lanes."""
+
+
+@dataclass
+class SharedNames:
+    """Signs that two vehicles share a name.
+
+    Attributes
+    ----------
+    rows
+        Number of rows.
+    repeated
+        Rows of a vehicle at a time at which it has another row, elsewhere.
+    jumps
+        Steps between two rows of a vehicle that are longer than any vehicle can move.
+    example
+        One of the vehicles, and when.
+    """
+
+    rows: int = 0
+    repeated: int = 0
+    jumps: int = 0
+    example: str = ""
+
+    def findings(self, where: str) -> Iterator[Diagnostic]:
+        """Yield an error if so many rows are concerned that vehicles are missing, or a warning."""
+        hint = "Give each vehicle a name of its own."
+        if self.repeated:
+            problem = (
+                f"{number_of(self.repeated, 'row')} of {self.rows:,} {by_number(self.repeated, 'has', 'have')} the name"
+                f" and the time of another row, in another place ({self.example}): two vehicles share a name"
+            )
+            yield Diagnostic("shared names", where, problem, hint, self.repeated > ERROR_SHARED_SHARE * self.rows)
+        if self.jumps > ERROR_SHARED_SHARE * self.rows:
+            problem = (
+                f"vehicles jump in {self.jumps:,} of {number_of(self.rows, 'row')}, faster than {MAX_SPEED_M_S:g} m/s:"
+                " two vehicles share a name, or times are wrong"
+            )
+            yield Diagnostic("jumps", where, problem, hint, self.jumps > ERROR_JUMP_SHARE * self.rows)
+
+
+@dataclass
+class RoadCheck:
+    """Counts vehicles that do not fit the roads, table by table.
+
+    Attributes
+    ----------
+    roads
+        The network; None without one, then only headings and names are checked.
+    region
+        The region of interest.
+    motor_types
+        Vehicle types of motor vehicles; others do not count.
+    positions, off_road, against
+        Positions of moving vehicles, and those off the road and against the lanes.
+    beside_m
+        Distance of those off the road from the nearest lane, at most :data:`AROUND_M`, of each table.
+    headings, across
+        Headings of moving vehicles, and those off their motion.
+    off_motion_deg
+        By how much each of these is off its motion, counter-clockwise, of each table.
+    names
+        Signs of shared names.
+    """
+
+    roads: Network | None
+    region: Roi
+    motor_types: frozenset[str]
+    positions: int = 0
+    off_road: int = 0
+    against: int = 0
+    beside_m: list[FloatArray] = field(default_factory=list)
+    headings: int = 0
+    across: int = 0
+    off_motion_deg: list[FloatArray] = field(default_factory=list)
+    names: SharedNames = field(default_factory=SharedNames)
+
+    def __post_init__(self) -> None:
+        self._lanes = None if self.roads is None else RoadLanes(self.roads)
+        self._positions_m: list[FloatArray] = []
+
+    def add(self, table: pa.Table) -> None:
+        """Count the rows of a table of :data:`egvs.traffic.fcd.FCD_SCHEMA`."""
+        import pyarrow.compute as pc
+
+        names = table["id"].combine_chunks().dictionary_encode()
+        is_motor = pc.is_in(table["type"], pa.array(sorted(self.motor_types), pa.string())).to_numpy()
+        vehicle, time_ms = names.indices.to_numpy().astype(np.int64), table["time_ms"].to_numpy()
+        xy_m = np.column_stack([table["x"].to_numpy(), table["y"].to_numpy()])
+        order = np.lexsort((time_ms, vehicle))
+        vehicle, time_ms, xy_m = vehicle[order], time_ms[order], xy_m[order]
+        yaw_rad, is_motor = np.deg2rad(90.0 - table["angle"].to_numpy()[order]), is_motor[order]
+        self._count_shared(names.dictionary, vehicle, time_ms, xy_m)
+
+        first, second, motion_m = _motions(vehicle, time_ms, xy_m)
+        counts = is_motor[first] & self._is_around(xy_m[first])
+        first, second, motion_m = first[counts], second[counts], motion_m[counts]
+        motion_rad = np.arctan2(motion_m[:, 1], motion_m[:, 0])
+        self._count_headings(yaw_rad[first], yaw_rad[second], motion_rad)
+        if self._lanes is not None and len(first):
+            if len(first) > _MAX_POSITIONS:
+                chosen = np.sort(np.random.default_rng(0).choice(len(first), _MAX_POSITIONS, replace=False))
+                first, motion_rad = first[chosen], motion_rad[chosen]
+            self._count_positions(self._lanes, xy_m[first], motion_rad)
+
+    def _is_around(self, xy_m: FloatArray) -> NDArray[np.bool_]:
+        low_m = np.array(self.region.origin_m[:2]) - AROUND_M
+        high_m = np.add(self.region.origin_m, self.region.size_m)[:2] + AROUND_M
+        around: NDArray[np.bool_] = ((xy_m >= low_m) & (xy_m <= high_m)).all(axis=1)
+        return around
+
+    def _count_shared(self, names: pa.Array, vehicle: IntArray, time_ms: IntArray, xy_m: FloatArray) -> None:
+        same = np.diff(vehicle) == 0
+        step_ms = np.diff(time_ms)
+        distance_m = np.hypot(*np.diff(xy_m, axis=0).T)
+        repeated = np.flatnonzero(same & (step_ms == 0))
+        jumps = same & (distance_m > MIN_JUMP_M) & (distance_m > MAX_SPEED_M_S * step_ms / 1000.0)
+        self.names.rows += len(vehicle)
+        self.names.repeated += len(repeated)
+        self.names.jumps += int(jumps.sum())
+        if len(repeated) and not self.names.example:
+            row = repeated[0]
+            self.names.example = f"{names[int(vehicle[row])].as_py()!r} at {time_ms[row] / 1000.0:g} s"
+
+    def _count_headings(self, first_rad: FloatArray, second_rad: FloatArray, motion_rad: FloatArray) -> None:
+        turn_rad = _wrap(second_rad - first_rad)
+        is_steady = np.abs(turn_rad) <= np.deg2rad(MAX_TURN_DEG)
+        off_rad = _wrap(first_rad + turn_rad / 2.0 - motion_rad)[is_steady]
+        across = np.abs(off_rad) > np.deg2rad(ACROSS_DEG)
+        self.headings += len(off_rad)
+        self.across += int(across.sum())
+        self.off_motion_deg.append(np.rad2deg(off_rad[across]))
+
+    def _count_positions(self, lanes: RoadLanes, xy_m: FloatArray, motion_rad: FloatArray) -> None:
+        near = lanes.near(xy_m, BESIDE_M)
+        on_road = np.zeros(len(xy_m), dtype=np.bool_)
+        on_road[near.row] = True
+        in_junction = lanes.in_junctions(xy_m)
+        leads_on = np.zeros(len(xy_m), dtype=np.bool_)
+        off_rad = _wrap(motion_rad[near.row] - near.yaw_rad)
+        leads_on[near.row[np.abs(off_rad) < np.deg2rad(AGAINST_DEG)]] = True
+        off_road = ~(on_road | in_junction)
+        self.positions += len(xy_m)
+        self.off_road += int(off_road.sum())
+        self.against += int((on_road & ~in_junction & ~leads_on).sum())
+        self.beside_m.append(_distances_m(lanes, xy_m[off_road]))
+        self._positions_m.append(xy_m)
+
+    def alignment(self) -> Alignment | None:
+        """Compare the positions with the lanes, and find a shift that fits better; None without positions or lanes."""
+        if self.roads is None or not self._positions_m:
+            return None
+        return lane_alignment.align(np.concatenate(self._positions_m), self.roads)
+
+    def findings(self, where: str) -> Iterator[Diagnostic]:
+        """Yield errors and warnings.
+
+        Parameters
+        ----------
+        where
+            Key of the file, for messages.
+        """
+        yield from self.names.findings(where)
+        yield from self._heading_findings(where)
+        yield from self._position_findings(where)
+
+    def _heading_findings(self, where: str) -> Iterator[Diagnostic]:
+        if self.across <= WARN_SHARE * self.headings:
+            return
+        median_deg = np.median(np.abs(np.concatenate(self.off_motion_deg)))
+        problem = (
+            f"{format_percent(self.across / self.headings, 0)} of {number_of(self.headings, 'heading')} of moving"
+            f" vehicles are more than {ACROSS_DEG:g} degrees off their motion (median {median_deg:.0f} degrees)"
+        )
+        hint = "Check the angles: FCD has degrees clockwise from north, tracks counter-clockwise from x."
+        is_error = self._is_error(self.across, self.headings, ERROR_HEADING_SHARE)
+        yield Diagnostic("headings", where, problem, hint, is_error)
+
+    def _position_findings(self, where: str) -> Iterator[Diagnostic]:
+        alignment = self.alignment()
+        if alignment is None:
+            return
+        misplaced = self.off_road + self.against
+        gain = alignment.fitted_share - alignment.share
+        is_shifted = np.hypot(*alignment.shift_m) >= ERROR_SHIFT_M and gain >= ERROR_SHIFT_GAIN
+        is_error = self._is_error(misplaced, self.positions, ERROR_SHARE)
+        is_error |= is_shifted and self.positions >= MIN_POSITIONS
+        hint = "Check the coordinate system, and whether vehicles and network show the same place."
+        if is_error or self.off_road > WARN_SHARE * self.positions:
+            distance_m = np.median(np.concatenate([*self.beside_m, [0.0] * (not self.off_road)]))
+            problem = (
+                f"{format_percent(self.off_road / self.positions, 0)} of {number_of(self.positions, 'position')} of"
+                f" moving vehicles are more than {BESIDE_M:g} m beside every lane (median {distance_m:.1f} m)"
+            )
+            problem += f"; {alignment.describe()}"
+            yield Diagnostic("vehicles off the road", where, problem, hint, is_error)
+        else:
+            yield from alignment.warnings(where)
+        if self.against > WARN_SHARE * self.positions:
+            problem = (
+                f"{format_percent(self.against / self.positions, 0)} of {number_of(self.positions, 'position')} of"
+                " moving vehicles are on lanes that lead the other way"
+            )
+            hint = "Check that the map is not mirrored, the side of driving, and the order of times."
+            is_error = self._is_error(self.against, self.positions, ERROR_AGAINST_SHARE)
+            yield Diagnostic("vehicles against lanes", where, problem, hint, is_error)
+
+    @staticmethod
+    def _is_error(number: int, of: int, share: float) -> bool:
+        return of >= MIN_POSITIONS and number > share * of
+
+
+def check_tables(
+    tables: Iterable[pa.Table],
+    roads: Network | None,
+    region: Roi,
+    motor_types: frozenset[str],
+    names: SharedNames | None = None,
+) -> RoadCheck:
+    """Count the vehicles of some tables that do not fit the roads.
+
+    Parameters
+    ----------
+    tables
+        Rows of :data:`egvs.traffic.fcd.FCD_SCHEMA`, in order of time.
+    roads
+        The network; None without one.
+    region
+        The region of interest.
+    motor_types
+        Vehicle types of motor vehicles.
+    names
+        Signs of shared names, where they were found before and the tables have no such rows any more.
+    """
+    check = RoadCheck(roads, region, motor_types)
+    for table in tables:
+        if table.num_rows:
+            check.add(table)
+    if names is not None:
+        check.names = names
+    return check
+
+
+def _motions(vehicle: IntArray, time_ms: IntArray, xy_m: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return pairs of rows between which a vehicle moves, and its motion (n, 2); rows are by vehicle, then time."""
+    steps_ms = np.diff(time_ms)[np.diff(vehicle) == 0]
+    steps_ms = steps_ms[steps_ms > 0]
+    if not len(steps_ms):
+        none = np.empty(0, dtype=np.int64)
+        return none, none, np.empty((0, 2))
+    lag = max(1, int(np.ceil(BASE_S * 1000.0 / np.median(steps_ms))))
+    first = np.arange(len(vehicle) - lag)
+    second = first + lag
+    motion_m = xy_m[second] - xy_m[first]
+    duration_s = (time_ms[second] - time_ms[first]) / 1000.0
+    distance_m = np.hypot(*motion_m.T)
+    moves = (vehicle[second] == vehicle[first]) & (duration_s > 0.0) & (duration_s <= MAX_BASE_S)
+    moves &= (distance_m >= MIN_MOTION_M) & (distance_m > MOVING_M_S * duration_s)
+    moves &= distance_m <= np.maximum(MAX_SPEED_M_S * duration_s, MIN_JUMP_M)
+    return first[moves], second[moves], motion_m[moves]
+
+
+def _distances_m(lanes: RoadLanes, xy_m: FloatArray) -> FloatArray:
+    """Return the distance of positions (n, 2) from the nearest lane, at most :data:`AROUND_M`, (n,)."""
+    distance_m = np.full(len(xy_m), AROUND_M)
+    near = lanes.near(xy_m, AROUND_M)
+    np.minimum.at(distance_m, near.row, near.distance_m)
+    return distance_m
+
+
+def _wrap(angle_rad: FloatArray) -> FloatArray:
+    """Return angles from -pi to pi."""
+    wrapped: FloatArray = np.mod(angle_rad + np.pi, 2.0 * np.pi) - np.pi
+    return wrapped
