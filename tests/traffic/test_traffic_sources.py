@@ -30,9 +30,6 @@ class SmallSource:
     def modules(self, scenario):  # type: ignore[no-untyped-def]
         return ("egvs.core.wording",)
 
-    def check(self, scenario, world):  # type: ignore[no-untyped-def]
-        return iter(())
-
     def frame_count(self, scenario):  # type: ignore[no-untyped-def]
         return 7
 

@@ -112,7 +112,7 @@ class SharedNames:
                 f" and the time of another row, in another place ({self.example}): two vehicles share a name"
             )
             yield Diagnostic("shared names", where, problem, hint, self.repeated > ERROR_SHARED_SHARE * self.rows)
-        if self.jumps > ERROR_SHARED_SHARE * self.rows:
+        elif self.jumps > ERROR_SHARED_SHARE * self.rows:
             problem = (
                 f"vehicles jump in {self.jumps:,} of {number_of(self.rows, 'row')}, faster than {MAX_SPEED_M_S:g} m/s:"
                 " two vehicles share a name, or times are wrong"
