@@ -203,6 +203,23 @@ def test_junction_without_lanes_is_road(tmp_path: Path) -> None:
     assert counted(rows, network.read_net_xml(path)).off_road == 0
 
 
+def test_network_may_end_beside_the_region(tmp_path: Path) -> None:
+    """Its lanes end 5 m beyond the region; vehicles drive on for 25 m, where nothing is known."""
+    path = tmp_path / "made.net.xml"
+    path.write_text(f'<net version="1.20">{edge("we", "-25,-1.6 25,-1.6")}</net>')
+    steps = np.arange(20)
+    angle = np.full(20, 90.0)
+    rows = {"time_ms": 500.0 * steps, "vehicle": 0.0 * steps, "x": -50.0 + 5.0 * steps, "y": angle * 0 - 1.6}
+    rows["angle"] = angle
+    names = ["v"] * 20
+    zeros = np.zeros(20)
+    columns = [rows["time_ms"].astype(np.int64), names, ["car"] * 20, rows["x"], rows["y"], zeros, angle, zeros, zeros]
+    region = Roi((-20.0, -20.0, 0.0), (40.0, 40.0, 5.0))
+    table = pa.table(columns, schema=fcd.FCD_SCHEMA)
+    check = check_tables([table], network.read_net_xml(path), region, frozenset(["car"]))
+    assert (check.headings, check.positions, check.off_road) == (19, 11, 0)
+
+
 def test_stopped_vehicles_with_noisy_headings_do_not_count(roads: Network) -> None:
     rows = drive(speed_m_s=0.0)
     rng = np.random.default_rng(5)

@@ -4,7 +4,8 @@ A measured scan is wrong where its points are in another frame than the scenario
 another site. Each of these is a *reading* of the file: positions of the points relative to a sensor. For each reading,
 the world is cast along the directions of the points. A point *agrees* if it is on the surface that its beam meets, to
 :data:`ON_SURFACE_M` and :data:`ON_SURFACE_SHARE` of its range, at right angles to that surface: a small error of the
-pose moves ground far along the beam, but hardly away from the ground.
+pose moves ground far along the beam, but hardly away from the ground. Where effects let beams through a surface, such
+as the crown of a tree, points on it agree, and points behind it.
 
 Ground looks the same in many readings, so a reading fits clearly better if many more points agree
 (:data:`MIN_LARGE_GAIN`), or some more (:data:`MIN_GAIN`) and many of those that are not on the ground
@@ -15,9 +16,10 @@ leaves out, agree in no reading. Nothing is searched: the stated pose is right, 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray
@@ -25,6 +27,8 @@ from egvs.core.wording import by_number, format_percent, number_of
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose, Site
+
+Bools = NDArray[np.bool_]
 
 ON_SURFACE_M, ON_SURFACE_SHARE = 0.3, 0.01
 """A point that is no farther from a surface than this distance and this share of its range together is on it."""
@@ -125,13 +129,16 @@ def check_measured_scans(scanner: Scanner, sites: Sequence[Site]) -> Iterator[Di
     InputError
         When a scan cannot be read.
     """
+    worlds = [scanner]
+    if scanner.opaque_world is not scanner.scene.world:
+        worlds.append(Scanner(replace(scanner.scene, effects=())))
     for site in sites:
         if site.points is None:
             continue
         points_m = scanner.read_measured(site)
         where = f"site {site.name}: points: {site.points}"
         yield from _warn_repeated(points_m, scanner.scene.sensor(site.sensor).beams, where)
-        yield from _warn_other_reading(scanner, site, points_m, sites, where)
+        yield from _warn_other_reading(worlds, site, points_m, sites, where)
 
 
 def _warn_repeated(points_m: FloatArray, beams: int, where: str) -> Iterator[Diagnostic]:
@@ -156,16 +163,16 @@ def _warn_repeated(points_m: FloatArray, beams: int, where: str) -> Iterator[Dia
 
 
 def _warn_other_reading(
-    scanner: Scanner, site: Site, points_m: FloatArray, sites: Sequence[Site], where: str
+    worlds: Sequence[Scanner], site: Site, points_m: FloatArray, sites: Sequence[Site], where: str
 ) -> Iterator[Diagnostic]:
     """Report a scan that fits the static world better in another reading, or in none."""
-    if not scanner.scene.world.faces.size:
+    if not worlds[0].scene.world.faces.size:
         return
     if len(points_m) > _MAX_POINTS:
         chosen = np.random.default_rng(0).choice(len(points_m), _MAX_POINTS, replace=False)
         points_m = points_m[np.sort(chosen)]
     readings = list(_readings(site, points_m, sites))
-    agreements = [compare_with_world(scanner, reading) for reading in readings]
+    agreements = [compare_with_world(worlds, reading) for reading in readings]
     agreement, best_agreement = agreements[0], max(agreements, key=lambda other: other.share)
     best = readings[agreements.index(best_agreement)]
     text = (
@@ -209,16 +216,32 @@ def _readings(site: Site, points_m: FloatArray, sites: Sequence[Site]) -> Iterat
         yield Reading(f"of site {other.name}, in its sensor's frame", other.pose, turned)
 
 
-def compare_with_world(scanner: Scanner, reading: Reading) -> Agreement:
-    """Count the points of a reading that are on surfaces of the static world."""
+def compare_with_world(worlds: Sequence[Scanner], reading: Reading) -> Agreement:
+    """Count the points of a reading that are on surfaces of the static world.
+
+    Parameters
+    ----------
+    worlds
+        Scanners of the scene, with different surfaces that let beams through.
+    reading
+        The reading.
+    """
     range_m = np.linalg.norm(reading.ends_m, axis=1)
     ends_m = reading.ends_m[range_m > _MIN_RANGE_M]
     range_m = range_m[range_m > _MIN_RANGE_M]
-    if not len(ends_m):
-        return Agreement(len(reading.ends_m), 0, 0)
-    directions = ends_m / range_m[:, None]
+    on_ground, on_structure = np.zeros((2, len(ends_m)), dtype=np.bool_)
+    if len(ends_m):
+        for scanner in worlds:
+            is_on_surface, is_ground = _compare_points(scanner, reading.pose, ends_m, range_m)
+            on_ground |= is_on_surface & is_ground
+            on_structure |= is_on_surface & ~is_ground
+    return Agreement(len(reading.ends_m), int((on_ground & ~on_structure).sum()), int(on_structure.sum()))
+
+
+def _compare_points(scanner: Scanner, pose: Pose, ends_m: FloatArray, range_m: FloatArray) -> tuple[Bools, Bools]:
+    """Return whether points are on the surface that their beam meets, and whether that is the ground, (n,) each."""
     world = scanner.opaque_world
-    hits = scanner.sweep_from(reading.pose, directions, 2.0 * float(range_m.max()))
+    hits = scanner.sweep_from(pose, ends_m / range_m[:, None], 2.0 * float(range_m.max()))
     face = hits.face
     assert face is not None, "a sweep has faces"
     hit = face >= 0
@@ -226,7 +249,8 @@ def compare_with_world(scanner: Scanner, reading: Reading) -> Agreement:
     normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     off_m = np.abs(((hits.ends_m[hit] - ends_m[hit]) * normals).sum(axis=1))
-    agrees = off_m <= ON_SURFACE_M + ON_SURFACE_SHARE * range_m[hit]
-    is_ground = np.array([kind == "ground" for _, kind in world.solids], dtype=np.bool_)
-    on_ground = is_ground[world.solid_of_face[face[hit]]]
-    return Agreement(len(reading.ends_m), int((agrees & on_ground).sum()), int((agrees & ~on_ground).sum()))
+    is_on_surface, is_ground = np.zeros((2, len(ends_m)), dtype=np.bool_)
+    is_on_surface[hit] = off_m <= ON_SURFACE_M + ON_SURFACE_SHARE * range_m[hit]
+    ground_solids = np.array([kind == "ground" for _, kind in world.solids], dtype=np.bool_)
+    is_ground[hit] = ground_solids[world.solid_of_face[face[hit]]]
+    return is_on_surface, is_ground

@@ -3,7 +3,8 @@
 Wrong coordinates, another convention of angles, a mirrored map or shared names give a complete result that is wrong.
 Four things are counted, of motor vehicles in and around the region of interest:
 
-- *off the road*: positions of moving vehicles more than :data:`BESIDE_M` beside every lane, and in no junction;
+- *off the road*: positions of moving vehicles more than :data:`BESIDE_M` beside every lane, and in no junction. Beyond
+  the region of interest, only positions within the bounds of all lanes count, for a network may end there;
 - *against the lanes*: positions on lanes that all lead the other way. In junctions, nothing is said about directions;
 - *headings*: headings that are more than :data:`ACROSS_DEG` off the motion;
 - *shared names*: rows of one vehicle at one time in two places, and steps that no vehicle can make.
@@ -174,21 +175,21 @@ class RoadCheck:
         self._count_shared(names.dictionary, vehicle, time_ms, xy_m)
 
         first, second, motion_m = _motions(vehicle, time_ms, xy_m)
-        counts = is_motor[first] & self._is_around(xy_m[first])
+        counts = is_motor[first] & self._is_around(xy_m[first], AROUND_M)
         first, second, motion_m = first[counts], second[counts], motion_m[counts]
         motion_rad = np.arctan2(motion_m[:, 1], motion_m[:, 0])
         self._count_headings(yaw_rad[first], yaw_rad[second], motion_rad)
-        if self._lanes is not None and len(first):
+        if self._lanes is not None and len(self._lanes):
+            covered = self._is_around(xy_m[first], 0.0) | _is_inside(xy_m[first], *self._lanes.bounds_m)
+            first, motion_rad = first[covered], motion_rad[covered]
             if len(first) > _MAX_POSITIONS:
                 chosen = np.sort(np.random.default_rng(0).choice(len(first), _MAX_POSITIONS, replace=False))
                 first, motion_rad = first[chosen], motion_rad[chosen]
             self._count_positions(self._lanes, xy_m[first], motion_rad)
 
-    def _is_around(self, xy_m: FloatArray) -> NDArray[np.bool_]:
-        low_m = np.array(self.region.origin_m[:2]) - AROUND_M
-        high_m = np.add(self.region.origin_m, self.region.size_m)[:2] + AROUND_M
-        around: NDArray[np.bool_] = ((xy_m >= low_m) & (xy_m <= high_m)).all(axis=1)
-        return around
+    def _is_around(self, xy_m: FloatArray, margin_m: float) -> NDArray[np.bool_]:
+        low_m = np.array(self.region.origin_m[:2])
+        return _is_inside(xy_m, low_m - margin_m, low_m + self.region.size_m[:2] + margin_m)
 
     def _count_shared(self, names: pa.Array, vehicle: IntArray, time_ms: IntArray, xy_m: FloatArray) -> None:
         same = np.diff(vehicle) == 0
@@ -339,6 +340,12 @@ def _motions(vehicle: IntArray, time_ms: IntArray, xy_m: FloatArray) -> tuple[In
     moves &= (distance_m >= MIN_MOTION_M) & (distance_m > MOVING_M_S * duration_s)
     moves &= distance_m <= np.maximum(MAX_SPEED_M_S * duration_s, MIN_JUMP_M)
     return first[moves], second[moves], motion_m[moves]
+
+
+def _is_inside(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> NDArray[np.bool_]:
+    """Return whether positions (n, 2) are in a rectangle, (n,)."""
+    inside: NDArray[np.bool_] = ((xy_m >= low_m) & (xy_m <= high_m)).all(axis=1)
+    return inside
 
 
 def _distances_m(lanes: RoadLanes, xy_m: FloatArray) -> FloatArray:

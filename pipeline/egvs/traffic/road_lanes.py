@@ -130,6 +130,12 @@ class RoadLanes:
         along_m = points_m[segment + 1, :2] - points_m[segment, :2]
         return NearbyLanes(row, lane, distance_m, height_m, np.arctan2(along_m[:, 1], along_m[:, 0]))
 
+    @property
+    def bounds_m(self) -> FloatArray:
+        """South-west and north-east corner of the middle lines, (2, 2)."""
+        points_m = np.concatenate(self._lines_m)[:, :2]
+        return np.array([points_m.min(axis=0), points_m.max(axis=0)])
+
     def in_junctions(self, xy_m: FloatArray) -> NDArray[np.bool_]:
         """Return whether positions (n, 2) are inside the outline of a junction, (n,)."""
         import shapely
