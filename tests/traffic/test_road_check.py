@@ -66,7 +66,7 @@ def findings(rows: Rows, roads: Network | None) -> dict[str, Diagnostic]:
 
 def test_traffic_on_its_lanes_has_no_finding(roads: Network) -> None:
     check = counted(drive(), roads)
-    assert (check.off_road, check.against, check.across, check.names.repeated) == (0, 0, 0, 0)
+    assert (check.off_lanes, check.against, check.across, check.names.repeated) == (0, 0, 0, 0)
     assert check.positions >= 60
     assert list(check.findings("traffic.fcd")) == []
 
@@ -101,6 +101,21 @@ def turn_across(rows: Rows) -> None:
     rows["angle"] += 90.0
 
 
+def turn_a_little(rows: Rows) -> None:
+    rows["angle"] += 30.0
+
+
+def count_in_milliseconds(rows: Rows) -> None:
+    """Times that are a thousandth of what they are: nobody drives at 10 km/s."""
+    rows["time_ms"] /= 100.0
+
+
+def interleave_names(rows: Rows) -> None:
+    """Two vehicles of one name, never at the same time."""
+    rows["time_ms"] += np.where(rows["vehicle"] % 2, 250.0, 0.0)
+    rows["vehicle"] = rows["vehicle"] // 2
+
+
 def turn_half(rows: Rows) -> None:
     """Of every second vehicle."""
     rows["angle"] += np.where(rows["vehicle"] % 2, 180.0, 0.0)
@@ -113,13 +128,16 @@ def share_names(rows: Rows) -> None:
 @pytest.mark.parametrize(
     ("mistake", "expected"),
     [
-        (shift, {"vehicles off the road": "are more than 1 m beside every lane (median "}),
+        (shift, {"vehicles off their lanes": "are more than 1 m beside every lane that leads their way (median "}),
         (swap, {"vehicles against lanes": "89 % of "}),
         (mirror, {"vehicles against lanes": "89 % of "}),
-        (reverse, {"vehicles against lanes": "89 % of ", "headings": "(median 180 degrees)"}),
+        (reverse, {"vehicles against lanes": "89 % of ", "headings": "(median of all 180 degrees)"}),
         (use_radians, {"headings": "75 % of "}),
         (use_mathematical_angles, {"headings": "100 % of "}),
-        (turn_across, {"headings": "(median 90 degrees)"}),
+        (turn_across, {"headings": "(median of all 90 degrees)"}),
+        (turn_a_little, {"headings": "(median of all 30 degrees)"}),
+        (count_in_milliseconds, {"jumps": "of 80 rows, faster than 60 m/s"}),
+        (interleave_names, {"jumps": "faster than 60 m/s"}),
         (turn_half, {"headings": "50 % of "}),
         (share_names, {"shared names": "40 rows of 80 have the name and the time of another row"}),
     ],
@@ -138,8 +156,8 @@ def test_mistake_is_an_error_with_its_number(
 def test_shift_is_part_of_the_message(roads: Network) -> None:
     rows = drive()
     shift(rows)
-    assert "moved by" in findings(rows, roads)["vehicles off the road"].problem
-    assert "+7.0 m north" in findings(rows, roads)["vehicles off the road"].problem
+    assert "moved by" in findings(rows, roads)["vehicles off their lanes"].problem
+    assert "+7.0 m north" in findings(rows, roads)["vehicles off their lanes"].problem
 
 
 @pytest.mark.parametrize("mistake", [use_radians, share_names])
@@ -200,7 +218,7 @@ def test_junction_without_lanes_is_road(tmp_path: Path) -> None:
     path = tmp_path / "made.net.xml"
     path.write_text(f'<net version="1.20">{edges}{junction}</net>')
     rows = {key: values[:20] for key, values in drive().items()}
-    assert counted(rows, network.read_net_xml(path)).off_road == 0
+    assert counted(rows, network.read_net_xml(path)).off_lanes == 0
 
 
 def test_network_may_end_beside_the_region(tmp_path: Path) -> None:
@@ -217,7 +235,7 @@ def test_network_may_end_beside_the_region(tmp_path: Path) -> None:
     region = Roi((-20.0, -20.0, 0.0), (40.0, 40.0, 5.0))
     table = pa.table(columns, schema=fcd.FCD_SCHEMA)
     check = check_tables([table], network.read_net_xml(path), region, frozenset(["car"]))
-    assert (check.headings, check.positions, check.off_road) == (19, 11, 0)
+    assert (check.headings, check.positions, check.off_lanes) == (19, 11, 0)
 
 
 def test_stopped_vehicles_with_noisy_headings_do_not_count(roads: Network) -> None:

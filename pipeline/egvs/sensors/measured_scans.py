@@ -56,6 +56,7 @@ _MIN_RANGE_M = 0.1
 _MIRRORED = {
     "with y mirrored": np.diag([1.0, -1.0, 1.0]),
     "with x mirrored": np.diag([-1.0, 1.0, 1.0]),
+    "with z mirrored": np.diag([1.0, 1.0, -1.0]),
     "with x and y swapped": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
 

@@ -132,9 +132,10 @@ class RoadLanes:
 
     @property
     def bounds_m(self) -> FloatArray:
-        """South-west and north-east corner of the middle lines, (2, 2)."""
+        """South-west and north-east corner of all lanes, (2, 2)."""
         points_m = np.concatenate(self._lines_m)[:, :2]
-        return np.array([points_m.min(axis=0), points_m.max(axis=0)])
+        half_width_m = self._half_widths_m.max()
+        return np.array([points_m.min(axis=0) - half_width_m, points_m.max(axis=0) + half_width_m])
 
     def in_junctions(self, xy_m: FloatArray) -> NDArray[np.bool_]:
         """Return whether positions (n, 2) are inside the outline of a junction, (n,)."""
