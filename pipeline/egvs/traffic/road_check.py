@@ -355,7 +355,8 @@ def _motions(vehicle: IntArray, time_ms: IntArray, xy_m: FloatArray) -> tuple[In
     motion_m = xy_m[second] - xy_m[first]
     duration_s = (time_ms[second] - time_ms[first]) / 1000.0
     distance_m = np.hypot(*motion_m.T)
-    moves: NDArray[np.bool_] = (vehicle[second] == vehicle[first]) & (duration_s > 0.0) & (duration_s <= MAX_BASE_S)
+    same_vehicle: NDArray[np.bool_] = vehicle[second] == vehicle[first]
+    moves = same_vehicle & (duration_s > 0.0) & (duration_s <= MAX_BASE_S)
     moves &= (distance_m >= MIN_MOTION_M) & (distance_m > MOVING_M_S * duration_s)
     moves &= distance_m <= np.maximum(MAX_SPEED_M_S * duration_s, MIN_JUMP_M)
     return first[moves], second[moves], motion_m[moves]
