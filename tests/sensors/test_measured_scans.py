@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -135,8 +136,8 @@ def test_repeated_points_are_counted(scanned: Path, copies: float, is_error: boo
         lambda points_m, _: rng.permutation(np.concatenate([points_m, points_m[: int(copies * len(points_m))]])),
     )
     assert (finding.rule, finding.is_error) == ("repeated points", is_error)
-    number = int(finding.problem.split()[0].replace(",", ""))
-    assert number == pytest.approx(copies * int(finding.problem.split()[3].replace(",", "")) / (1.0 + copies), abs=1.0)
+    repeated, points = (int(number.replace(",", "")) for number in re.findall(r"[0-9,]+[0-9]", finding.problem))
+    assert repeated == pytest.approx(copies * points / (1.0 + copies), abs=1.0)
 
 
 def test_several_turns_get_a_warning(scanned: Path) -> None:

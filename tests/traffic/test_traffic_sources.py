@@ -114,7 +114,7 @@ def test_names_that_vehicles_share_are_an_error_of_any_source(mini: Path, monkey
     monkeypatch.setattr(plugins, "load_plugin", lambda group, name: source)
     monkeypatch.setattr(plugins, "plugin_names", lambda group: ["small"] if group == traffic_sources.GROUP else [])
     (error,) = check.check_scenario(load(use_tracks(mini))).errors
-    assert error.problem.startswith("2 rows of 100 have the name and the time of another row, in another place ('a' at")
+    assert "got 2 others in 100 rows, in other places ('a' at 3 s)" in error.problem
 
 
 def test_rejects_source_without_a_part(monkeypatch: pytest.MonkeyPatch) -> None:

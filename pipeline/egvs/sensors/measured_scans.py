@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray
-from egvs.core.wording import by_number, format_percent, number_of
+from egvs.core.wording import format_percent, number_of
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose, Site
@@ -152,8 +152,8 @@ def _warn_repeated(points_m: FloatArray, beams: int, where: str) -> Iterator[Dia
     repeated = int((np.diff(ordered, axis=0) == 0.0).all(axis=1).sum())
     if repeated:
         problem = (
-            f"{number_of(repeated, 'point')} of {len(compared):,} {by_number(repeated, 'is', 'are')} in the file more"
-            " than once, and would count as beams of their own"
+            f"expected each point once, got {repeated:,} repeated ones in {number_of(len(compared), 'point')}, which"
+            " would count as beams of their own"
         )
         is_error = repeated > MAX_REPEATED * len(compared)
         yield Diagnostic("repeated points", where, problem, "Write each return once.", is_error)

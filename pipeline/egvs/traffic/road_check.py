@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, IntArray, Roi
-from egvs.core.wording import by_number, format_percent, number_of
+from egvs.core.wording import format_percent, number_of
 from egvs.traffic import lane_alignment
 from egvs.traffic.lane_alignment import Alignment
 from egvs.traffic.network import Network
@@ -120,8 +120,8 @@ class SharedNames:
         hint = "Give each vehicle a name of its own."
         if self.repeated:
             problem = (
-                f"{number_of(self.repeated, 'row')} of {self.rows:,} {by_number(self.repeated, 'has', 'have')} the name"
-                f" and the time of another row, in another place ({self.example}): two vehicles share a name"
+                f"expected one row for each vehicle and time, got {self.repeated:,} others in {number_of(self.rows, 'row')},"
+                f" in other places ({self.example}): two vehicles share a name"
             )
             yield Diagnostic("shared names", where, problem, hint, self.repeated > ERROR_SHARED_SHARE * self.rows)
         elif self.jumps > ERROR_SHARED_SHARE * self.rows:
