@@ -120,8 +120,8 @@ class SharedNames:
         hint = "Give each vehicle a name of its own."
         if self.repeated:
             problem = (
-                f"expected one row for each vehicle and time, got {self.repeated:,} others in {number_of(self.rows, 'row')},"
-                f" in other places ({self.example}): two vehicles share a name"
+                f"expected one row for each vehicle and time, got {self.repeated:,} others in"
+                f" {number_of(self.rows, 'row')}, in other places ({self.example}): two vehicles share a name"
             )
             yield Diagnostic("shared names", where, problem, hint, self.repeated > ERROR_SHARED_SHARE * self.rows)
         elif self.jumps > ERROR_SHARED_SHARE * self.rows:
