@@ -106,6 +106,21 @@ def test_warns_of_site_within_junction_unless_above_road() -> None:
     ]
 
 
+def test_bridge_over_the_street_is_another_level(street: Path) -> None:
+    """At z = 8 m, over the middle of the region: the street is in the region, and a sensor below stands in no lane."""
+    bridge = '<lane id="bridge_0" index="0" length="80" shape="20,-40,8.00 20,40,8.00"/>'
+    lanes = LANES + f'<edge id="bridge" from="c" to="d">{bridge}</edge>\n'
+    (street / "net.net.xml").write_text(net_xml(lanes))
+    statics(street)
+    sites(street, "below,20,7,3", "deck,20,7,9", "street,20,1.6,3")
+    result = found(street)
+    assert "region" not in result
+    assert [line.partition(" is in ")[::2] for line in result["sites on lanes"]] == [
+        ("[sites.csv: site deck: (20, 7, 9)", "lane bridge_0]"),
+        ("[sites.csv: site street: (20, 1.6, 3)", "lane west_1]"),
+    ]
+
+
 def test_height_above_road_decides(street: Path) -> None:
     lifted = LANES.replace("80,1.60 -40,1.60", "80,1.60,4.00 -40,1.60,4.00").replace(
         "-40,-1.60 80,-1.60", "-40,-1.60,4.00 80,-1.60,4.00"
