@@ -95,14 +95,29 @@ def test_warns_of_site_within_junction_unless_above_road() -> None:
     """Of the hill's junction (0, -2) is in no lane, and (60, 12) is beside the road."""
     roads = Carriageway.of(network.read_net_xml(SCENARIOS / "hill" / "network.net.xml"))
     at_m = np.array([0.0, -2.0])
-    assert roads.lanes_at(at_m[None]) == [None]
     road_m = roads.height_m(roads.nearest(at_m), at_m)
+    assert roads.lanes_at(np.array([[*at_m, road_m + 2]])) == [None]
     places = {"low": (0.0, -2.0, road_m + 2), "high": (0.0, -2.0, road_m + 4.6), "beside": (60.0, 12.0, road_m + 2)}
     candidates = tuple(Site(name, Pose(*place), "VLP-32C") for name, place in places.items())
     subject = CheckInputs(egvs.load(SCENARIOS / "hill"), carriageway=roads, sites=candidates)
     assert [str(finding) for finding in scene_checks.warn_sites_on_lanes(subject)] == [
         f"sites.csv: site low: (0, -2, {road_m + 2:g}) is within a junction. "
         "Move it beside the road, or more than 4.5 m above it."
+    ]
+
+
+def test_bridge_over_the_street_is_another_level(street: Path) -> None:
+    """At z = 8 m, over the middle of the region: the street is in the region, and a sensor below stands in no lane."""
+    bridge = '<lane id="bridge_0" index="0" length="80" shape="20,-40,8.00 20,40,8.00"/>'
+    lanes = LANES + f'<edge id="bridge" from="c" to="d">{bridge}</edge>\n'
+    (street / "net.net.xml").write_text(net_xml(lanes))
+    statics(street)
+    sites(street, "below,20,7,3", "deck,20,7,9", "street,20,1.6,3")
+    result = found(street)
+    assert "region" not in result
+    assert [line.partition(" is in ")[::2] for line in result["sites on lanes"]] == [
+        ("[sites.csv: site deck: (20, 7, 9)", "lane bridge_0]"),
+        ("[sites.csv: site street: (20, 1.6, 3)", "lane west_1]"),
     ]
 
 

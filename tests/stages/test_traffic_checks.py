@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from egvs.scenario.loading import load
 from egvs.scoring import occupancy
+from egvs.stages import check
 from tests.stages.conftest import net_xml
 from tests.stages.test_check import found
 
@@ -219,3 +223,39 @@ def test_warns_of_period_without_traffic() -> None:
     assert "no vehicle ever enters the region" in told.problem
     assert list(occupancy.warn_empty_periods({"day": 0.0, "night": 0.0})) == []  # told of all of them at once
     assert list(occupancy.warn_empty_periods({"": 0.0})) == []
+
+
+def recorded(street: Path, change: Callable[[float, float, float], tuple[float, float, float]]) -> Path:
+    """The street with a finished file of two cars, one each way; ``change`` is applied to x, y and angle."""
+    rows = ["time;id;x;y;angle;type"]
+    for step in range(40):
+        for name, x, y, angle in (("east", 2.0 * step - 20.0, -1.6, 90.0), ("west", 60.0 - 2.0 * step, 1.6, 270.0)):
+            rows.append(";".join([f"{0.5 * step}", name, *(f"{value:.6f}" for value in change(x, y, angle)), "car"]))
+    (street / "recorded.csv").write_text("\n".join(rows))
+    text = (street / "scenario.toml").read_text()
+    network = 'network = "net.net.xml"\n'
+    assert network in text
+    (street / "scenario.toml").write_text(text.replace(network, 'fcd = "recorded.csv"\nroads = "net.net.xml"\n'))
+    return street
+
+
+@pytest.mark.parametrize(
+    ("change", "rule"),
+    [
+        (lambda x, y, angle: (x, y, angle), None),
+        (lambda x, y, angle: (x, y - 7.0, angle), "vehicles off their lanes"),
+        (lambda x, y, angle: (x, -y, angle), "vehicles against lanes"),
+        (lambda x, y, angle: (x, y, math.radians(angle)), "headings"),
+        (lambda x, y, angle: (x, y, 90.0 - angle), "headings"),
+    ],
+)
+def test_rejects_vehicles_that_fit_no_road(
+    street: Path, run_egvs, change: Callable[[float, float, float], tuple[float, float, float]], rule: str | None
+) -> None:
+    """The run stops before anything is written."""
+    checked = check.check_scenario(load(recorded(street, change)))
+    assert [error.rule for error in checked.errors] == ([] if rule is None else [rule])
+    if rule is not None:
+        code, _, err = run_egvs("run", street, "--out", street / "out")
+        assert (code, checked.errors[0].problem in " ".join(err.split())) == (2, True)
+        assert not list((street / "out").glob("*.p*"))

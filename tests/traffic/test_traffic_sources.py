@@ -13,6 +13,9 @@ from egvs.runs import stage_keys
 from egvs.scenario.loading import load
 from egvs.stages import check
 from egvs.traffic import traffic_sources
+from egvs.traffic.fcd import FrameWindow
+from egvs.traffic.road_check import SharedNames
+from egvs.traffic.traffic_sources import RecordedTraffic
 from tests.installed import needs
 
 TRACKS = 'tracks = ["tracks.csv"]'
@@ -20,9 +23,10 @@ MESSAGE = "needs the extension tracks"
 
 
 class SmallSource:
-    """A source of seven frames that names one module."""
+    """A source of seven frames without vehicles that names one module."""
 
     KEYS = ("tracks",)
+    shared_names = SharedNames()
 
     def files(self, scenario):  # type: ignore[no-untyped-def]
         return [scenario.find(name, "traffic.tracks") for name in scenario.traffic.tracks]
@@ -30,14 +34,12 @@ class SmallSource:
     def modules(self, scenario):  # type: ignore[no-untyped-def]
         return ("egvs.core.wording",)
 
-    def check(self, scenario, world):  # type: ignore[no-untyped-def]
-        return iter(())
-
     def frame_count(self, scenario):  # type: ignore[no-untyped-def]
         return 7
 
     def record(self, scenario, world):  # type: ignore[no-untyped-def]
-        raise NotImplementedError
+        window = FrameWindow(7, 500, complete=True)
+        return RecordedTraffic((), window, {}, frozenset(), {}, (), (), shared_names=self.shared_names)
 
     def for_new(self, options):  # type: ignore[no-untyped-def]
         raise NotImplementedError
@@ -105,12 +107,20 @@ def test_stages_name_the_modules_of_a_source(mini: Path, monkeypatch: pytest.Mon
     assert check.check_scenario(scenario).errors == ()
 
 
+def test_names_that_vehicles_share_are_an_error_of_any_source(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Above one in a hundred rows; the source counts them, since its rows have no such vehicles any more."""
+    source = SmallSource()
+    source.shared_names = SharedNames(rows=100, repeated=2, example="'a' at 3 s")
+    monkeypatch.setattr(plugins, "load_plugin", lambda group, name: source)
+    monkeypatch.setattr(plugins, "plugin_names", lambda group: ["small"] if group == traffic_sources.GROUP else [])
+    (error,) = check.check_scenario(load(use_tracks(mini))).errors
+    assert "got 2 others in 100 rows, in other places ('a' at 3 s)" in error.problem
+
+
 def test_rejects_source_without_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     if not traffic_sources.is_installed():
         pytest.skip("no source is installed, whose entry point the message names")
     (name, *_) = plugins.plugin_names(traffic_sources.GROUP)
     monkeypatch.setattr(plugins, "load_plugin", lambda group, name: object())
-    with pytest.raises(
-        MissingBackendError, match="it has no KEYS, files, modules, check, frame_count, record, for_new"
-    ):
+    with pytest.raises(MissingBackendError, match="it has no KEYS, files, modules, frame_count, record, for_new"):
         traffic_sources.load_source(name)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from egvs.core import polylines
 from egvs.core.grid import Vec3
-from egvs.traffic.network import LANE_WIDTH_M, Edge, Lane, Network
-from egvs.world.carriageway import Carriageway, is_carriageway
+from egvs.traffic.network import LANE_WIDTH_M, Edge, Lane, Network, is_carriageway
+from egvs.world.carriageway import Carriageway
 
 Floats = NDArray[np.float64]
 

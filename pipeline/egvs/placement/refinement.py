@@ -560,9 +560,9 @@ class _PoseEvaluator:
         """Which sites are in a lane or a junction, (n,) bool; none if candidates are not checked for it either."""
         if self._carriageway is None or not sites:
             return np.zeros(len(sites), dtype=np.bool_)
-        positions_m = np.array([[site.pose.x_m, site.pose.y_m] for site in sites])
+        positions_m = np.array([site.pose.position_m for site in sites])
         in_lane: NDArray[np.bool_] = np.array([lane is not None for lane in self._carriageway.lanes_at(positions_m)])
-        return in_lane | self._carriageway.in_junctions(positions_m)
+        return in_lane | self._carriageway.in_junctions(positions_m[:, :2])
 
     @cached_property
     def ground_m(self) -> GroundHeight | None:

@@ -28,8 +28,7 @@ from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.scoring.blindspots import CELL_M, blindspot_map_shape
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
-from egvs.traffic.network import Lane, Network
-from egvs.world.carriageway import is_carriageway
+from egvs.traffic.network import Lane, Network, is_carriageway
 
 OVERLAP_POINTS = SEEN_WELL_POINTS
 """A sensor counts in a map of overlap where it has at least this number of points."""

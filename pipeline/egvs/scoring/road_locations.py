@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 from egvs.core.grid import Roi
 from egvs.traffic.approach_names import ApproachNames, approach_name
 from egvs.traffic.directions import TURNS, U_TURN, compass
-from egvs.traffic.network import LANE_WIDTH_M, Connection, Edge, Lane, Network
-from egvs.world.carriageway import is_carriageway
+from egvs.traffic.network import LANE_WIDTH_M, Connection, Edge, Lane, Network, is_carriageway
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

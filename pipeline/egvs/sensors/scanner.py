@@ -153,7 +153,21 @@ class Scanner:
         if site.points is None:
             return self._cast(site.pose, sensor, f"site {site.name}")
         site_feasibility.check_pose(self.scene, site.pose, sensor, f"site {site.name}")
-        return self._measured_scan(site, site.points, sensor)
+        return self._measured_scan(site, sensor)
+
+    def read_measured(self, site: Site) -> FloatArray:
+        """Return the points of the measured scan of a site, (n, 3) in the world frame; an InputError names the site."""
+        assert site.points is not None, "the site has a measured scan"
+        where = f"site {site.name}: points"
+        return self._read_points(self.scene.scenario.find(site.points, where), where)
+
+    def sweep_from(self, pose: Pose, directions: FloatArray, range_m: float) -> EmptyScan:
+        """Cast beams in any directions along the world axes, (n, 3), from a pose, and return the faces that they hit.
+
+        The solids that carry the sensor at the pose are left out. Effects that split or cut beams do not act.
+        """
+        caster = self._caster(False, self.scene.own_supports(pose))
+        return caster.sweep(pose.position_m, directions, range_m)
 
     def check(self, sites: Iterable[Site]) -> None:
         """Raise one InputError that names every site where its sensor cannot stand; nothing is cast."""
@@ -234,11 +248,9 @@ class Scanner:
                 self._directions[mount] = sensor.directions(*pose.angles_deg)
             return self._directions[mount]
 
-    def _measured_scan(self, site: Site, file: str, sensor: Sensor) -> Scan:
+    def _measured_scan(self, site: Site, sensor: Sensor) -> Scan:
         """The returns of a measured scan that lie on beams that can meet the region of interest."""
-        where = f"site {site.name}: points"
-        path = self.scene.scenario.find(file, where)
-        points = self._read_points(path, where)
+        points = self.read_measured(site)
         position_m = np.asarray(site.pose.position_m)
         ends = points - position_m
         range_m = np.sqrt((ends**2).sum(axis=1))
@@ -249,7 +261,8 @@ class Scanner:
         beam = np.flatnonzero(reaches)
         if not len(beam):
             problem = f"none of {number_of(len(points), 'point')} lies on a beam that can meet the region of interest"
-            raise InputError(f"{where}: {path}", problem, "Save the points in the world frame.")
+            where = f"site {site.name}: points: {site.points}"
+            raise InputError(where, problem, "Save the points in the world frame.")
         weight = np.ones(len(beam)) if self.columns else None
         rows = EmptyScan(beam.astype(np.uint32), ends[beam], np.ones(len(beam), dtype=np.bool_), weight=weight)
         return Scan(site.pose, sensor, len(points), rows)

@@ -155,9 +155,9 @@ def _road_conflicts(sites: Sequence[Site], carriageway: Carriageway | None) -> l
     conflicts: list[str | None] = [None] * len(sites)
     if carriageway is None:
         return conflicts
-    positions_m = np.array([[site.pose.x_m, site.pose.y_m] for site in sites]).reshape(-1, 2)
+    positions_m = np.array([site.pose.position_m for site in sites]).reshape(-1, 3)
     lanes = carriageway.lanes_at(positions_m)
-    in_junctions = carriageway.in_junctions(positions_m)
+    in_junctions = carriageway.in_junctions(positions_m[:, :2])
     for i, lane in enumerate(lanes):
         if lane is not None:
             conflicts[i] = IN_A_LANE

@@ -1,6 +1,7 @@
 """The scan stage: what each candidate site sees of the static world alone, as ``scans.parquet``.
 
-Steps: cast the beams of every site (or read its measured scan), :mod:`egvs.sensors.scanner`; write one row per beam
+Steps: compare measured scans with the static world (:mod:`egvs.sensors.measured_scans`); cast the beams of every site
+(or read its measured scan), :mod:`egvs.sensors.scanner`; write one row per beam
 that can meet the region of interest. Scans do not depend on traffic, voxels or gamma.
 
 With ``scan.keep = false`` nothing is written, and the score stage casts the beams.
@@ -17,9 +18,10 @@ import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core.errors import WARNINGS_KEY, InputError, unknown_site
+from egvs.core.errors import WARNINGS_KEY, DiagnosticsError, InputError, unknown_site
 from egvs.core.threads import map_ordered
 from egvs.formats import point_clouds
+from egvs.sensors import measured_scans
 from egvs.sensors.scanner import Scan, Scanner
 from egvs.sensors.sites import ScannedSite
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
@@ -61,6 +63,11 @@ def run(context: StageContext, inputs: StageDependencies, points: tuple[str, ...
     _check_cloud_names(points)
     scanner = Scanner(scene)
     scanner.check(scene.sites)
+    measured = list(measured_scans.check_measured_scans(scanner, scene.sites))
+    errors = [finding for finding in measured if finding.is_error]
+    warnings = [finding for finding in measured if not finding.is_error]
+    if errors:
+        raise DiagnosticsError(errors, warnings)
     summary: Summary
     if context.scenario.scan.keep:
         summary = _write_scans(context, inputs, scanner, points, cloud)
@@ -71,6 +78,8 @@ def run(context: StageContext, inputs: StageDependencies, points: tuple[str, ...
             if site.name in points:
                 clouds.append(_write_cloud(context.folder, site.name, scanner.scan_site(site), cloud))
         summary = {"sites": len(names), "kept": False, "clouds": clouds}
+    if warnings:
+        summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *(warning.to_json() for warning in warnings)]
     skipped = scene.skipped("scan")
     if skipped:
         summary["skipped"] = skipped

@@ -29,6 +29,7 @@ from egvs.sensors.sites import Site
 from egvs.stages.inputs import CheckInputs, ErrorCollector
 from egvs.traffic import sumo_folder
 from egvs.traffic.network import Network
+from egvs.traffic.road_lanes import LEVEL_M
 from egvs.world import clearances, geolocation, supports
 from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
@@ -54,9 +55,9 @@ def check_lanes_in_region(inputs: CheckInputs) -> Iterator[Diagnostic]:
         yield Diagnostic("region", key, problem, hint, is_error=True)
         return
     centre_m = (low_m + high_m)[:2] / 2.0
-    lane = inputs.carriageway.nearest(centre_m)
-    road_m = inputs.carriageway.height_m(lane, centre_m)
-    if road_m > high_m[2] or road_m + clearances.CLEARANCE_M < low_m[2]:
+    roads_m = inputs.carriageway.heights_in(low_m, high_m)
+    if not np.any((roads_m <= high_m[2]) & (roads_m + clearances.CLEARANCE_M >= low_m[2])):
+        road_m = inputs.carriageway.height_m(inputs.carriageway.nearest(centre_m), centre_m)
         problem = f"the region extends from z = {low_m[2]:g} to {high_m[2]:g} m, but the road is at z = {road_m:.1f} m"
         yield Diagnostic("region", key, problem, hint, is_error=True)
 
@@ -203,15 +204,17 @@ def _sites_on_road(
     sites: tuple[Site, ...], carriageway: Carriageway, network: Network | None
 ) -> Iterator[tuple[Site, str]]:
     """The sites in a lane or within a junction, no higher than the clearance above the road, and where they are."""
-    at_m = np.array([[site.pose.x_m, site.pose.y_m] for site in sites])
-    lanes = carriageway.lanes_at(at_m)
+    position_m = np.array([site.pose.position_m for site in sites])
+    at_m = position_m[:, :2]
+    lanes = carriageway.lanes_at(position_m)
     in_junction = carriageway.in_junctions(at_m)
     for number, site in enumerate(sites):
         lane = lanes[number]
         if lane is None and not in_junction[number]:
             continue
         nearest = carriageway.nearest(at_m[number]) if lane is None else lane
-        if site.pose.z_m - carriageway.height_m(nearest, at_m[number]) > clearances.CLEARANCE_M:
+        above_m = site.pose.z_m - carriageway.height_m(nearest, at_m[number])
+        if not -LEVEL_M <= above_m <= clearances.CLEARANCE_M:
             continue
         yield site, "within a junction" if lane is None else f"in {_describe_lane(carriageway.names[lane], network)}"
 

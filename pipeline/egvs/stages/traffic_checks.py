@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
@@ -19,7 +19,19 @@ from egvs.formats import xml
 from egvs.scenario.model import Scenario
 from egvs.stages import height_checks
 from egvs.stages.inputs import CheckInputs, ErrorCollector
-from egvs.traffic import demand, fcd, finished_fcd, network, recording, sumo_folder, traffic_sources, user_files
+from egvs.traffic import (
+    demand,
+    fcd,
+    finished_fcd,
+    network,
+    recording,
+    road_check,
+    sumo_folder,
+    traffic_sources,
+    user_files,
+)
+from egvs.traffic.network import ROAD_VCLASSES
+from egvs.traffic.traffic_sources import RecordedTraffic
 from egvs.world import clearances, geolocation
 
 Rule = Callable[[CheckInputs], Iterator[Diagnostic]]
@@ -263,7 +275,7 @@ def _is_near_region(positions_m: FloatArray, box: Roi) -> NDArray[np.bool_]:
 
 @_for_each_period
 def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
-    """Report finished files without the requested frames, with vehicles of unknown size, or that disappear."""
+    """Report finished files without the requested frames, or whose vehicles have no size, disappear, or fit no road."""
     scenario = inputs.scenario
     errors = ErrorCollector()
     if scenario.traffic.pedestrian_tracks is not None:
@@ -271,19 +283,48 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         errors.attempt("traffic", lambda: recording.check_recorded_people(scenario, effects))
     if traffic_sources.source_key(scenario.traffic) is not None:
         world = geolocation.scenario_georeference(scenario)
-        try:
-            yield from traffic_sources.source_of(scenario).check(scenario, world)
-        except InputError as error:
-            errors.findings.append(Diagnostic.of("traffic", error))
+        recorded = errors.attempt("traffic", lambda: traffic_sources.source_of(scenario).record(scenario, world))
+        if recorded is not None:
+            yield from recorded.warnings
+            yield from errors.attempt("traffic", partial(_recorded_findings, scenario, recorded)) or ()
     if scenario.traffic.fcd is None:
         yield from errors.findings
         return
     window = errors.attempt("traffic", lambda: finished_fcd.fcd_window(scenario))
     if window is not None:
         content = window[1]
-        errors.attempt("traffic", lambda: finished_fcd.check_types(scenario, content.types, content.sizes))
+        vtypes = errors.attempt("traffic", lambda: finished_fcd.check_types(scenario, content.types, content.sizes))
         yield from finished_fcd.presence_warnings(scenario, content)
+        if vtypes is not None:
+            classes = finished_fcd.vehicle_classes(scenario, content, vtypes)
+            yield from errors.attempt("traffic", partial(_fcd_findings, scenario, classes)) or ()
     yield from errors.findings
+
+
+def _recorded_findings(scenario: Scenario, recorded: RecordedTraffic) -> list[Diagnostic]:
+    """Compare the vehicles of a recording with the roads; people beside simulated vehicles are on no lanes."""
+    where = f"{sumo_folder.traffic_location(scenario)}.{traffic_sources.source_key(scenario.traffic)}"
+    if scenario.traffic.tracks is None:
+        return list(recorded.shared_names.findings(where))
+    motor_types = frozenset(name for name, size in recorded.sizes.items() if size.vclass in ROAD_VCLASSES)
+    roads = sumo_folder.read_network(scenario)
+    compared = road_check.check_tables(
+        recorded.rows, roads, scenario.roi.box, motor_types - recorded.uncounted_types, recorded.shared_names
+    )
+    return list(compared.findings(where))
+
+
+def _fcd_findings(scenario: Scenario, classes: Mapping[str, str]) -> list[Diagnostic]:
+    """Compare the vehicles of a finished FCD file with the roads."""
+    name = scenario.traffic.fcd
+    assert name is not None
+    path = scenario.find(name, "traffic.fcd")
+    rows = fcd.read_fcd(path)
+    if finished_fcd.read_fcd_metadata(path) is None:
+        rows = fcd.georeference_rows(rows, geolocation.scenario_georeference(scenario), path, scenario.traffic.fcd_geo)
+    motor_types = frozenset(name for name, vclass in classes.items() if vclass in ROAD_VCLASSES)
+    compared = road_check.check_tables(rows, sumo_folder.read_network(scenario), scenario.roi.box, motor_types)
+    return list(compared.findings(f"{sumo_folder.traffic_location(scenario)}.fcd = {name!r}"))
 
 
 def check_vehicle_kinds(inputs: CheckInputs) -> Iterator[Diagnostic]:

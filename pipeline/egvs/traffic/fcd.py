@@ -12,6 +12,7 @@ complete. At the end, it checks that the file has all frames.
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import tempfile
 from collections.abc import Generator, Iterable, Iterator
@@ -109,6 +110,18 @@ def check_coordinates(path: Path, world: Georeference, is_geo: bool) -> None:
         next(tables, None)
 
 
+def has_heights(path: Path) -> bool:
+    """Return whether a file has heights (a column or an attribute ``z`` of its vehicles).
+
+    Raises
+    ------
+    InputError
+        As :func:`read_fcd` for the head of the file.
+    """
+    with closing(_source_batches(path, "vehicle")[0]) as batches:
+        return any("z" in batch.schema.names for batch in itertools.islice(batches, 1))
+
+
 def read_fcd(path: Path, element: str = "vehicle") -> Iterator[pa.Table]:
     """Read a file.
 
@@ -130,6 +143,11 @@ def read_fcd(path: Path, element: str = "vehicle") -> Iterator[pa.Table]:
         Names the file and the row if a column is missing, a value is not a number, times are not in order, or the file
         is damaged.
     """
+    yield from _checked_tables(*_source_batches(path, element))
+
+
+def _source_batches(path: Path, element: str) -> tuple[Generator[pa.RecordBatch, None, None], Path, str]:
+    """Return the batches of a file with the columns that are used, the file, and what it calls a row."""
     if not path.is_file():
         raise InputError(path, "no such file", "Use a file that SUMO wrote with --fcd-output.")
     with xml.open_bounded(path) as file:
@@ -137,13 +155,12 @@ def read_fcd(path: Path, element: str = "vehicle") -> Iterator[pa.Table]:
     if not head:
         raise InputError(path, "is empty", EXPECTED_FCD)
     if head.startswith(b"<"):
-        yield from _checked_tables(_read_xml(path, element), path, f"{element} element")
-    else:
-        read = _read_parquet if head.startswith(b"PAR1") else _read_csv
-        yield from _checked_tables(read(path, element), path, "row")
+        return _read_xml(path, element), path, f"{element} element"
+    read = _read_parquet if head.startswith(b"PAR1") else _read_csv
+    return read(path, element), path, "row"
 
 
-def _read_csv(path: Path, element: str) -> Iterator[pa.RecordBatch]:
+def _read_csv(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:
     from pyarrow import csv
 
     with (
@@ -171,7 +188,7 @@ def _read_csv(path: Path, element: str) -> Iterator[pa.RecordBatch]:
             yield batch.rename_columns(list(columns))
 
 
-def _read_parquet(path: Path, element: str) -> Iterator[pa.RecordBatch]:
+def _read_parquet(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:
     import pyarrow.parquet as pq
 
     with _translate_parquet_errors(path), _open_seekable(path) as source:
@@ -228,7 +245,7 @@ def _check_rows(metadata: Any, path: Path) -> None:
         raise InputError(path, f"declares {metadata.num_rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)
 
 
-def _read_xml(path: Path, element: str) -> Iterator[pa.RecordBatch]:
+def _read_xml(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:
     rows: list[dict[str, str]] = []
     steps = _StepCheck(path)
     for step in xml.iter_elements(path, "fcd-export"):

@@ -37,6 +37,7 @@ from egvs.scenario.fields import Name, Positive, StrictModel
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import VehicleKind
 from egvs.traffic import fcd, sumo, sumo_folder, traffic_sources
+from egvs.traffic.network import CAR
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 _NEVER = -(2**63)
@@ -98,8 +99,11 @@ _SIZE_ATTRIBUTES = ("length", "width", "height")
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 """A number as SUMO reads it: ASCII digits, without underscores."""
 
-_DEFAULT_TYPES = frozenset(f"DEFAULT_{name}TYPE" for name in ("VEH", "TAXI", "BIKE", "RAIL", "PED", "CONTAINER"))
-"""Types that SUMO always has."""
+_DEFAULT_TYPES = {
+    "DEFAULT_VEHTYPE": CAR, "DEFAULT_TAXITYPE": "taxi", "DEFAULT_BIKETYPE": "bicycle", "DEFAULT_RAILTYPE": "rail",
+    "DEFAULT_PEDTYPE": "pedestrian", "DEFAULT_CONTAINERTYPE": "container",
+}  # fmt: skip
+"""Types that SUMO always has, and their vClasses."""
 
 _NETWORK = """\
 <net version="1.20">
@@ -221,7 +225,7 @@ def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[st
     """
     vtypes = list(_read_vtypes(size_files(scenario)))
     known = {kind.name for kind in scenario.traffic.kinds} | {vtype.attrib["id"] for vtype in vtypes} | set(declared)
-    missing = sorted(set(types) - known - _DEFAULT_TYPES)
+    missing = sorted(set(types) - known - _DEFAULT_TYPES.keys())
     if missing:
         names = ", ".join(map(repr, missing))
         problem = f"the sizes of these vehicle types in {scenario.traffic.fcd} are unknown: {names}"
@@ -231,6 +235,25 @@ def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[st
         )
         raise InputError(f"{sumo_folder.traffic_location(scenario)}.kinds", problem, hint)
     return vtypes
+
+
+def vehicle_classes(scenario: Scenario, survey: FcdSurvey, vtypes: Collection[Element]) -> dict[str, str]:
+    """Return the vClass of each vehicle type of a finished file, without starting SUMO.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    survey
+        Content of the file.
+    vtypes
+        From :func:`check_types`.
+    """
+    known = {name: size.vclass for name, size in sizes_of_kinds(scenario.traffic.kinds).items()}
+    known |= {name: size.vclass for name, size in survey.sizes.items()} | _DEFAULT_TYPES
+    known |= {vtype.attrib["id"]: vtype.get("vClass", CAR) for vtype in vtypes}
+    known |= {name: size.vclass for name, size in sizes_of_kinds(scenario.traffic.named_kinds).items()}
+    return {name: known[name] for name in survey.types}
 
 
 def _read_vtypes(paths: Collection[Path]) -> Iterator[Element]:

@@ -45,6 +45,12 @@ MAY_PASS_LETTERS = frozenset("GgsoO")
 CAR = "passenger"
 """SUMO vClass of cars."""
 
+ROAD_VCLASSES = (
+    "passenger", "private", "taxi", "bus", "coach", "delivery", "truck", "trailer", "motorcycle", "moped", "evehicle",
+    "hov", "emergency", "authority", "army", "vip", "tram",
+)  # fmt: skip
+"""A lane that admits one of these vClasses is carriageway."""
+
 _PEDESTRIAN = "pedestrian"
 _OSM_SUFFIXES = (".osm", ".osm.xml", ".osm.pbf")
 _HINT = "Use a network that netconvert wrote."
@@ -69,6 +75,11 @@ class Permission:
         if self.allow is not None:
             return vclass in self.allow
         return vclass not in self.disallow and "all" not in self.disallow
+
+
+def is_carriageway(permission: Permission) -> bool:
+    """Return whether a lane is for road vehicles."""
+    return any(permission.admits(vclass) for vclass in ROAD_VCLASSES)
 
 
 @dataclass(frozen=True)

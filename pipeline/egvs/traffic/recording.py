@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from egvs.core import limits
 from egvs.core.errors import Diagnostic, InputError, RunError
 from egvs.core.progress import ProgressCallback
 from egvs.core.resource_usage import peak_memory_of
@@ -30,6 +31,7 @@ from egvs.scenario.traffic_config import TrafficConfig
 from egvs.traffic import fcd, finished_fcd, locks, network, sumo, sumo_folder, traffic_sources
 from egvs.traffic.count_fit import CountFit, count_fits, missed_count_warnings
 from egvs.traffic.locks import DemandKey, RegionWatch, WatchedRegion, describe_distance
+from egvs.traffic.road_lanes import RoadLanes
 from egvs.traffic.sumo_folder import SimulationFolder, Timing
 from egvs.traffic.traffic_sources import RecordedTraffic
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
@@ -196,7 +198,56 @@ def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> I
     rows = fcd.read_fcd(path)
     if survey.metadata is None:
         rows = fcd.georeference_rows(rows, world, path, scenario.traffic.fcd_geo)
+    rows = rows_on_roads(rows, path, sumo_folder.read_network(scenario), window)
     yield Recording(rows, window, sizes, where, source=f"{where}.fcd = {name!r}", types=types)
+
+
+def rows_on_roads(
+    tables: Iterable[pa.Table], path: Path, roads: network.Network | None, window: fcd.FrameWindow
+) -> Iterator[pa.Table]:
+    """Set vehicles on the roads below them, if the network has heights and their file has none.
+
+    Parameters
+    ----------
+    tables
+        Rows of :data:`egvs.traffic.fcd.FCD_SCHEMA`. Those that get a height are held in memory.
+    path
+        The file that they are from.
+    roads
+        The network; None without one.
+    window
+        Which time steps are frames; later rows are left out.
+
+    Yields
+    ------
+    pyarrow.Table
+        The rows.
+
+    Raises
+    ------
+    InputError
+        When there are more rows than memory may hold.
+    """
+    if roads is None or not roads.has_heights or fcd.has_heights(path):
+        yield from tables
+        return
+    rows: list[pa.Table] = []
+    n_rows = 0
+    for table in tables:
+        rows.append(table)
+        n_rows += table.num_rows
+        limits.ROWS.check(path, n_rows, f"has more than {limits.ROWS.maximum:,} rows without a height")
+        first_ms = rows[0]["time_ms"][0].as_py() + window.skip_ms if window.first_ms is None else window.first_ms
+        if table["time_ms"][-1].as_py() > first_ms + window.count * window.period_ms:
+            break
+    if not rows:
+        return
+    table = pa.concat_tables(rows).combine_chunks()
+    names = table["id"].combine_chunks().dictionary_encode()
+    xy_m = np.column_stack([table["x"].to_numpy(), table["y"].to_numpy()])
+    yaw_rad = np.deg2rad(90.0 - table["angle"].to_numpy())
+    heights_m = RoadLanes(roads).heights_m(names.indices.to_numpy(), table["time_ms"].to_numpy(), xy_m, yaw_rad)
+    yield table.set_column(table.schema.get_field_index("z"), fcd.FCD_SCHEMA.field("z"), pa.array(heights_m))
 
 
 @contextmanager

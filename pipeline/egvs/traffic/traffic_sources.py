@@ -8,8 +8,8 @@ World frame (x east, y north, z up), metres, radians; times are whole millisecon
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,6 +25,7 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.traffic import sumo_folder
 from egvs.traffic.fcd import FrameWindow
+from egvs.traffic.road_check import SharedNames
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 GROUP = "egvs.traffic_sources"
@@ -35,7 +36,7 @@ TRACKS, PEDESTRIAN_TRACKS = "tracks", "pedestrian_tracks"
 EXTENSION = "tracks"
 """The extension of this program that reads them, for messages."""
 
-_REQUIRED = ("KEYS", "files", "modules", "check", "frame_count", "record", "for_new")
+_REQUIRED = ("KEYS", "files", "modules", "frame_count", "record", "for_new")
 
 
 class CoveredArea(Protocol):
@@ -69,6 +70,8 @@ class RecordedTraffic:
         count from the first of the recording.
     coverage
         What the recording could see; None where that is not known.
+    shared_names
+        What says that two road users share a name, of rows that are left out.
     """
 
     rows: Iterable[pa.Table]
@@ -79,6 +82,7 @@ class RecordedTraffic:
     warnings: Sequence[Diagnostic]
     unknown_boxes: Sequence[Mapping[str, Any]]
     coverage: CoveredArea | None = None
+    shared_names: SharedNames = field(default_factory=SharedNames)
 
 
 class TrafficSource(Protocol):
@@ -96,9 +100,6 @@ class TrafficSource(Protocol):
 
     def modules(self, scenario: Scenario) -> tuple[str, ...]:
         """Return the modules that read them, for the key of the stage; InputError when a file does not exist."""
-
-    def check(self, scenario: Scenario, world: Georeference) -> Iterator[Diagnostic]:
-        """Yield what is doubtful; InputError for a recording that cannot be used."""
 
     def frame_count(self, scenario: Scenario) -> int:
         """Return the number of frames of the recording; InputError when a file is damaged or too short."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
-from egvs.traffic.network import LANE_WIDTH_M, Lane, Network, Permission, Shape
+from egvs.traffic.network import LANE_WIDTH_M, Lane, Network, Shape, is_carriageway
 from egvs.world import clearances
 
 if TYPE_CHECKING:
@@ -26,12 +26,6 @@ if TYPE_CHECKING:
 
 Corner = Sequence[float] | FloatArray
 """x and y, or more, of a corner of a rectangle."""
-
-ROAD_VCLASSES = (
-    "passenger", "private", "taxi", "bus", "coach", "delivery", "truck", "trailer", "motorcycle", "moped", "evehicle",
-    "hov", "emergency", "authority", "army", "vip", "tram",
-)  # fmt: skip
-"""A lane that admits one of these vClasses is carriageway."""
 
 _PEDESTRIAN_FUNCTIONS = ("crossing", "walkingarea")
 
@@ -91,14 +85,21 @@ class Carriageway:
         return STRtree(self.areas)
 
     def lanes_at(self, at_m: FloatArray) -> list[int | None]:
-        """Return the index in :attr:`lanes` of the first lane that contains each point (n, 2); None for no lane."""
+        """Return the index in :attr:`lanes` of the lane that each sensor (n, 3) would stand in; None for no lane.
+
+        It is the highest lane below the sensor, and the first of equally high ones: one on a bridge is not in the way
+        of a sensor below it.
+        """
         import shapely
 
         lanes: list[int | None] = [None] * len(at_m)
-        points, lanes_there = self._tree.query(shapely.points(at_m), "intersects").tolist()
+        road_m = np.full(len(at_m), -np.inf)
+        points, lanes_there = self._tree.query(shapely.points(at_m[:, :2]), "intersects").tolist()
         for point, lane in sorted(zip(points, lanes_there, strict=True)):
-            if lanes[point] is None:
+            height_m = self.height_m(lane, at_m[point, :2])
+            if road_m[point] < height_m <= at_m[point, 2]:
                 lanes[point] = lane
+                road_m[point] = height_m
         return lanes
 
     def in_junctions(self, at_m: FloatArray) -> NDArray[np.bool_]:
@@ -133,6 +134,14 @@ class Carriageway:
 
         box = shapely.box(*low_m[:2], *high_m[:2])
         return shapely.union_all(shapely.intersection(self.areas[self._tree.query(box, "intersects")], box))
+
+    def heights_in(self, low_m: Corner, high_m: Corner) -> FloatArray:
+        """Return the height of each lane that crosses a rectangle, beside its middle, (n,)."""
+        import shapely
+
+        middle_m = (np.asarray(low_m)[:2] + np.asarray(high_m)[:2]) / 2.0
+        lanes = self._tree.query(shapely.box(*low_m[:2], *high_m[:2]), "intersects")
+        return np.array([self.height_m(int(lane), middle_m) for lane in lanes])
 
     def distance_m(self, low_m: Corner, high_m: Corner) -> float:
         """Return the distance from a rectangle to the nearest lane; 0 where a lane crosses it."""
@@ -169,8 +178,3 @@ def _outlines(shapes: Sequence[Shape]) -> NDArray[Any]:
     # areas only: GEOS cannot subtract a collection that contains lines
     outlines: NDArray[Any] = shapely.make_valid(polygons, method="structure", keep_collapsed=False)
     return outlines
-
-
-def is_carriageway(permission: Permission) -> bool:
-    """Return whether a lane is for road vehicles."""
-    return any(permission.admits(vclass) for vclass in ROAD_VCLASSES)

@@ -1,9 +1,9 @@
 """A triangulated ground through the lanes of a network.
 
-Steps: sample the centre line and both sides of each lane every few metres; thin the points to one per cell of half a
-metre (the mean, so that points of a plane stay on it; where lanes cross at different levels, only the lowest level);
-triangulate the points (Delaunay). Beyond the roads, the ground continues at the height of the nearest lane. World frame
-(x east, y north, z up), metres.
+Steps: sample the centre line and both sides of each lane every few metres; leave out lanes that cross above others, on
+the crossing and 5 m around it; thin the points to one per cell of half a metre (the mean of its lowest level, so that
+points of a plane stay on it); triangulate the points (Delaunay). Beyond the roads, the ground continues at the height
+of the nearest lane. World frame (x east, y north, z up), metres.
 
 Where points of a terrain are given, the ground beyond the roads goes through them. Then lanes more than 1.5 m above or
 below the terrain are bridges and tunnels, and no part of the ground; near the other lanes, the ground is that of the
@@ -19,6 +19,7 @@ interpolated, not measured.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 from egvs.core import polylines
 from egvs.core.limits import GROUND_POINTS
 from egvs.traffic.network import LANE_WIDTH_M, Edge, Lane, Network
+from egvs.traffic.road_lanes import RoadLanes
 
 if TYPE_CHECKING:
     from egvs.scenario.model import Scenario
@@ -57,7 +59,9 @@ _LEVEL_M = 1.5
 """Points of a cell that are higher above its lowest point than this belong to another level, e.g. a bridge."""
 
 _BESIDE_M = 5.0
-"""Within this distance of points of lanes, points of the terrain do not count."""
+"""Within this distance of points of lanes, points of the terrain do not count, nor do those of a lane above."""
+
+_CROSSING_STEP_M = 1.0
 
 _RIM_STEP_M = 50.0
 _MARGIN_M = 100.0
@@ -166,19 +170,35 @@ def triangulate_ground(
         When the ground would have too many points.
     """
     _check_point_count(roads, low_m, high_m, where)
-    lanes = np.concatenate(
-        [_sample_lane(lane, _width_m(edge, lane)) for edge in roads.all_edges for lane in edge.lanes]
-    )
+    lanes = [lane for edge in roads.all_edges for lane in edge.lanes]
+    samples = [_sample_lane(lane, _width_m(edge, lane)) for edge in roads.all_edges for lane in edge.lanes]
     if beyond_m is None:
-        points = _thin_points(lanes)
+        points = _thin_points(np.concatenate(_without_bridges(roads, lanes, samples)))
     else:
-        points = _join_terrain(lanes, beyond_m, low_m, high_m, where)
+        points = _join_terrain(np.concatenate(samples), beyond_m, low_m, high_m, where)
     low = points[:, :2].min(axis=0) - _MARGIN_M if low_m is None else low_m
     high = points[:, :2].max(axis=0) + _MARGIN_M if high_m is None else high_m
     is_inside = np.all((points[:, :2] > low) & (points[:, :2] < high), axis=1)
     rim = _rim(low, high)
     rim = np.column_stack([rim, points[_nearest(points[:, :2], rim), 2]])
     return _triangulate(np.concatenate([points[is_inside], rim]), low, high)
+
+
+def _without_bridges(roads: Network, lanes: Sequence[Lane], samples: Sequence[Floats]) -> list[Floats]:
+    """Leave out the points (n, 3) of lanes that cross above others, within :data:`_BESIDE_M` of these."""
+    heights = np.concatenate([lane.shape_m[:, 2] for lane in lanes])
+    if np.ptp(heights) <= _LEVEL_M:
+        return list(samples)
+    road_lanes = RoadLanes(roads)
+    kept = []
+    for lane, points in zip(lanes, samples, strict=True):
+        middle = polylines.points_at(lane.shape_m, np.arange(0.0, polylines.length_m(lane.shape_m), _CROSSING_STEP_M))
+        at = road_lanes.near(middle[:, :2], 0.0)
+        crossed = at.lane[at.height_m < middle[at.row, 2] - _LEVEL_M]
+        beside = road_lanes.near(points[:, :2], _BESIDE_M)
+        is_above = np.isin(beside.lane, crossed) & (beside.height_m < points[beside.row, 2] - _LEVEL_M)
+        kept.append(np.delete(points, np.unique(beside.row[is_above]), axis=0))
+    return kept
 
 
 def _join_terrain(lanes: Floats, terrain: Floats, low_m: Floats | None, high_m: Floats | None, where: object) -> Floats:

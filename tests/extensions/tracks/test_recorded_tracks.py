@@ -19,8 +19,10 @@ from egvs.core.errors import InputError
 from egvs.extensions.tracks import recorded_tracks
 from egvs.extensions.tracks.sources import TrackSource
 from egvs.formats.georeference import Georeference, WorldFrame
+from egvs.stages import check
 from tests.conftest import SCENARIO, collection, fcd, feature
 from tests.traffic.helpers import netgenerate
+from tests.traffic.test_road_lanes import edge
 
 HALF_CAR_M = 2.25
 
@@ -381,3 +383,59 @@ def test_solids_of_another_zero_than_tracks_are_an_error(mini: Path, run_egvs) -
     code, out, _ = run_egvs("check", mini)
     assert code == 2
     assert "1 of 1 solid near the region has its foot 112.0 m above the traffic beside it: house" in out
+
+
+def drives(folder: Path, rows: list[tuple[str, float, float, float, float]], roads: str) -> None:
+    """Use rows (vehicle, time_s, x_m, y_m, yaw_rad) of tracks on a network."""
+    use_tracks(folder, interaction_csv(rows), 'roads = "made.net.xml"\n')
+    (folder / "made.net.xml").write_text(f'<net version="1.20">{roads}</net>')
+
+
+def along(name: str, y_m: float, yaw_rad: float = 0.0, start_m: float = -10.0) -> list:
+    """A vehicle that drives 60 m along +x in 20 s."""
+    return [(name, 0.5 * step, start_m + 1.5 * step, y_m, yaw_rad) for step in range(41)]
+
+
+def error_rules(folder: Path) -> dict[str, str]:
+    return {error.rule: error.problem for error in check.check_scenario(egvs.load(folder)).errors}
+
+
+def test_tracks_that_fit_the_road_have_no_error(mini: Path) -> None:
+    drives(mini, along("a", 0.0), edge("e", "-50,0 100,0"))
+    assert error_rules(mini) == {}
+
+
+@pytest.mark.parametrize(
+    ("rows", "rule"),
+    [
+        (along("a", -7.0), "vehicles off their lanes"),
+        (along("a", 0.0, yaw_rad=math.pi / 2.0), "headings"),
+        (
+            [(name, 20.0 - time_s, *rest, math.pi) for name, time_s, *rest, _ in along("a", 0.0)],
+            "vehicles against lanes",
+        ),
+        ([*along("a", 0.0), *along("a", 0.0, start_m=5.0)], "shared names"),
+    ],
+)
+def test_tracks_that_fit_no_road_are_rejected(mini: Path, rows: list, rule: str) -> None:
+    """Each by the same rule as an FCD file."""
+    drives(mini, rows, edge("e", "-50,0 100,0"))
+    assert list(error_rules(mini)) == [rule]
+
+
+def test_rows_of_a_second_vehicle_are_counted(mini: Path) -> None:
+    """Of 82 rows, 41 are of another vehicle with the same name; equal rows say nothing about a second one."""
+    drives(mini, [*along("a", 0.0), *along("a", 0.0, start_m=5.0)], edge("e", "-50,0 100,0"))
+    assert error_rules(mini)["shared names"].startswith(
+        "expected one row for each vehicle and time, got 41 others in 82 rows, in other places ('a' at 0 s)"
+    )
+    drives(mini, [*along("a", 0.0), *along("a", 0.0)], edge("e", "-50,0 100,0"))
+    assert error_rules(mini) == {}
+
+
+def test_tracks_below_a_bridge_stay_on_the_lower_road(mini: Path, run_egvs, tmp_path: Path) -> None:
+    """In the middle of the crossing, the lane of the bridge is the nearest in plan, 6 m above."""
+    drives(mini, along("a", 1.0), edge("e", "-50,0 100,0") + edge("bridge", "20,-50,6 20,50,6"))
+    assert run_egvs("traffic", mini, "--out", tmp_path / "run")[0] == 0
+    table = pq.read_table(tmp_path / "run" / "trajectories.parquet")
+    np.testing.assert_allclose(table["z_m"].to_numpy(), table["height_m"].to_numpy() / 2.0)

@@ -20,20 +20,19 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
 from egvs.extensions.tracks.model import Tracks
 from egvs.extensions.tracks.motion import motion_yaw_rad
 from egvs.traffic.class_sizes import ClassSize
+from egvs.traffic.road_check import MAX_SPEED_M_S, MIN_JUMP_M, SharedNames
 
 MOVING_M_S = 3.0
 """Speed above which the direction of motion is certain enough to check a heading."""
 
 HEADING_BASE_M = 1.0
 """Distance over which the direction of motion is measured where no heading is recorded."""
-
-MAX_SPEED_M_S, MIN_JUMP_M = 60.0, 2.0
-"""Two successive rows are a jump if they are farther apart than this distance and this speed allow."""
 
 VULNERABLE = frozenset(("pedestrian", "bicycle"))
 """Classes of people on foot and on bicycles, who do not count as vehicles."""
@@ -53,6 +52,9 @@ class CleaningReport:
         Rows without a finite time or position.
     duplicates
         Rows with the track and the time of an earlier row, dropped.
+    elsewhere, first_elsewhere
+        Those of them that are more than :data:`MIN_JUMP_M` from the earlier row, and the first as a text: two road
+        users share a name.
     jumps
         Where tracks were cut.
     headings_given, headings_from_motion, headings_unknown
@@ -76,6 +78,8 @@ class CleaningReport:
     tracks: int = 0
     dropped_rows: int = 0
     duplicates: int = 0
+    elsewhere: int = 0
+    first_elsewhere: str = ""
     jumps: int = 0
     headings_given: int = 0
     headings_from_motion: int = 0
@@ -87,6 +91,11 @@ class CleaningReport:
     height_scatter_m: float = 0.0
     step_s: float = 0.0
     classes: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def shared_names(self) -> SharedNames:
+        """What says that two road users share a name."""
+        return SharedNames(self.rows, self.elsewhere, self.jumps, self.first_elsewhere)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON."""
@@ -145,6 +154,7 @@ def clean_tracks(tracks: Tracks, sizes: Mapping[str, ClassSize]) -> CleanTracks:
     tracks = tracks.select(np.lexsort((tracks.time_s, tracks.track)))
     is_repeated = (np.diff(tracks.track, prepend=-1) == 0) & (np.diff(tracks.time_s, prepend=-np.inf) == 0)
     report.duplicates = int(is_repeated.sum())
+    _report_elsewhere(tracks, is_repeated, report)
     tracks = tracks.select(~is_repeated)
 
     part = _cut_at_jumps(tracks, report)
@@ -155,6 +165,18 @@ def clean_tracks(tracks: Tracks, sizes: Mapping[str, ClassSize]) -> CleanTracks:
         tracks.names, tracks.classes, size_m, tracks.track, part, tracks.time_s, tracks.x_m, tracks.y_m, yaw_rad,
         report, tracks.sources,
     )  # fmt: skip
+
+
+def _report_elsewhere(tracks: Tracks, is_repeated: NDArray[np.bool_], report: CleaningReport) -> None:
+    """Count the repeated rows that are in another place than the first row of the same track and time."""
+    repeated = np.flatnonzero(is_repeated)
+    kept = np.maximum.accumulate(np.where(is_repeated, 0, np.arange(tracks.n_rows)))[repeated]
+    distance_m = np.hypot(tracks.x_m[repeated] - tracks.x_m[kept], tracks.y_m[repeated] - tracks.y_m[kept])
+    elsewhere = repeated[distance_m > MIN_JUMP_M]
+    report.elsewhere = len(elsewhere)
+    if len(elsewhere):
+        row = elsewhere[0]
+        report.first_elsewhere = f"{tracks.names[tracks.track[row]]!r} at {tracks.time_s[row]:g} s"
 
 
 def _cut_at_jumps(tracks: Tracks, report: CleaningReport) -> IntArray:

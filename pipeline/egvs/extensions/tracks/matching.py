@@ -23,8 +23,8 @@ import numpy as np
 
 from egvs.core import polylines
 from egvs.core.grid import FloatArray, IntArray
-from egvs.extensions.tracks.alignment import FAR_M
 from egvs.extensions.tracks.resampling import ResampledTracks
+from egvs.traffic.lane_alignment import FAR_M
 from egvs.traffic.network import CAR, DEFAULT_SPEED_M_S, Lane, Network
 
 PERIOD_S = 0.5

@@ -21,9 +21,7 @@ import pyarrow as pa
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import by_number, number_of
-from egvs.extensions.tracks import alignment as track_alignment
 from egvs.extensions.tracks import cleaning, coverage, resampling
-from egvs.extensions.tracks.alignment import Alignment
 from egvs.extensions.tracks.cleaning import CleanTracks
 from egvs.extensions.tracks.coverage import Coverage
 from egvs.extensions.tracks.model import TrackFrame, Tracks
@@ -31,10 +29,13 @@ from egvs.extensions.tracks.resampling import ResampledTracks
 from egvs.extensions.tracks.sources import TrackSource
 from egvs.formats.georeference import WORLD, Georeference
 from egvs.scenario.model import Scenario
-from egvs.traffic import sumo_folder
+from egvs.traffic import lane_alignment, sumo_folder
 from egvs.traffic.class_sizes import CLASS_SIZES, class_sizes
 from egvs.traffic.fcd import FCD_SCHEMA, FrameWindow
+from egvs.traffic.lane_alignment import Alignment
 from egvs.traffic.network import Network
+from egvs.traffic.road_check import MAX_SPEED_M_S
+from egvs.traffic.road_lanes import RoadLanes
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 FRAMES_EACH = 4096
@@ -114,30 +115,42 @@ class RecordedTracks:
         """Yield rows of :data:`egvs.traffic.fcd.FCD_SCHEMA`, in order of time; the first frame is at ``first_ms``."""
         boxes, names = self.boxes, pa.array(self.tracks.names)
         type_names = pa.array(self.type_names)
-        half_m = np.array(self._sizes_m).reshape(-1, 3)[:, 0] / 2.0
+        front_m = self._fronts_m()
+        heights_m = self._road_heights_m(front_m)
         for first in range(0, self.window.count, FRAMES_EACH):
             rows = slice(*np.searchsorted(boxes.frame, [first, first + FRAMES_EACH]))
             track, yaw_rad = boxes.track[rows], boxes.yaw_rad[rows]
             if not track.size:
                 continue  # a pause: readers expect rows, and see from their times that frames are empty
             zeros = np.zeros(track.size)
-            front_m = np.column_stack([
-                boxes.x_m[rows] + half_m[track] * np.cos(yaw_rad), boxes.y_m[rows] + half_m[track] * np.sin(yaw_rad)
-            ])  # fmt: skip
-            heights_m = zeros if self.roads is None else track_alignment.road_heights(self.roads, front_m)
             yield pa.table(
                 [
                     first_ms + boxes.frame[rows] * self.window.period_ms,
                     names.take(pa.array(track)),
                     type_names.take(pa.array(track)),
-                    *front_m.T,
-                    heights_m,
+                    *front_m[rows].T,
+                    heights_m[rows],
                     90.0 - np.rad2deg(yaw_rad),
                     zeros,
                     boxes.speed_m_s[rows],
                 ],
                 schema=FCD_SCHEMA,
             )
+
+    def _fronts_m(self) -> FloatArray:
+        """Return the middle of the front of each box, (n, 2)."""
+        boxes = self.boxes
+        half_m = np.array(self._sizes_m).reshape(-1, 3)[boxes.track, 0] / 2.0
+        return np.column_stack([boxes.x_m + half_m * np.cos(boxes.yaw_rad), boxes.y_m + half_m * np.sin(boxes.yaw_rad)])
+
+    def _road_heights_m(self, front_m: FloatArray) -> FloatArray:
+        """Return the height of the road below the front of each box, (n,); 0 without a network."""
+        boxes = self.boxes
+        if self.roads is None:
+            return np.zeros(len(front_m))
+        is_vehicle = np.array([name not in cleaning.VULNERABLE for name in self.tracks.classes], dtype=np.bool_)
+        yaw_rad = np.where(is_vehicle[boxes.track], boxes.yaw_rad, np.nan)  # people walk across lanes
+        return RoadLanes(self.roads).heights_m(boxes.track, boxes.frame, front_m, yaw_rad)
 
     def unknown_boxes(self) -> list[dict[str, Any]]:
         """Return the gaps in which positions are unknown, as JSON; frames count from the first of the recording.
@@ -198,7 +211,7 @@ def read_recorded_tracks(scenario: Scenario, world: Georeference) -> RecordedTra
     first_s = float(np.nanmin(tracks.time_s)) + window.skip_ms / 1000.0
     boxes = resampling.resample(cleaned, first_s, window.period_ms / 1000.0, window.count, scenario.traffic.track_gap_s)
     roads = sumo_folder.read_network(scenario)
-    lanes_m = np.empty((0, 2)) if roads is None else track_alignment.lane_points(roads, scenario.roi.box)
+    lanes_m = np.empty((0, 2)) if roads is None else lane_alignment.lane_points(roads, scenario.roi.box)
     if scenario.traffic.coverage is None:
         area = coverage.estimate(cleaned, scenario.roi.box, lanes_m)
         inside = np.ones(boxes.frame.size, dtype=bool)
@@ -207,7 +220,7 @@ def read_recorded_tracks(scenario: Scenario, world: Georeference) -> RecordedTra
         area = coverage.read(path, world, scenario.roi.box, lanes_m)
         inside = area.contains(np.column_stack([boxes.x_m, boxes.y_m]))
         boxes = boxes.select(inside)
-    alignment = None if roads is None else track_alignment.align(_moving_vehicles(cleaned, boxes), roads)
+    alignment = None if roads is None else lane_alignment.align(_moving_vehicles(cleaned, boxes), roads)
     outside = int((~inside).sum())
     return RecordedTracks(replace(window, skip_ms=0), cleaned, boxes, area, outside, alignment, roads)
 
@@ -304,7 +317,7 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
         yield Diagnostic("track rows", where, problem, "Check how the file was written.")
     if report.jumps:
         problem = (
-            f"tracks jump {number_of(report.jumps, 'time')}, faster than {cleaning.MAX_SPEED_M_S:g} m/s; they"
+            f"tracks jump {number_of(report.jumps, 'time')}, faster than {MAX_SPEED_M_S:g} m/s; they"
             " are cut there, because"
             " the identity has probably switched to another road user"
         )
@@ -332,8 +345,6 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
         yield Diagnostic("track gaps", where, problem, "Raise track_gap_s if straight lines are good enough.")
     if recorded.coverage is not None:
         yield from recorded.coverage.warnings(where)
-    if recorded.alignment is not None:
-        yield from recorded.alignment.warnings(where)
 
 
 def track_source(scenario: Scenario) -> TrackSource:

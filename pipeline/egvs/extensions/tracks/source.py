@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egvs.core.errors import Diagnostic
 from egvs.extensions.tracks import recorded_tracks
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
@@ -37,16 +35,6 @@ class TrackTrafficSource:
         """Return this module and the readers of the files."""
         return __name__, *recorded_tracks.track_source(scenario).reader_modules()
 
-    def check(self, scenario: Scenario, world: Georeference) -> Iterator[Diagnostic]:
-        """Yield what is doubtful about the tracks; InputError where they are wrong."""
-        where = _key(scenario)
-        if scenario.traffic.tracks is not None:
-            yield from recorded_tracks.track_warnings(recorded_tracks.read_recorded_tracks(scenario, world), where)
-            return
-        people = recorded_tracks.read_recorded_pedestrians(scenario, world)
-        yield from recorded_tracks.track_warnings(people, where)
-        yield from recorded_tracks.pedestrian_warnings(people, _first_frame_ms(scenario) / 1000.0, where)
-
     def frame_count(self, scenario: Scenario) -> int:
         """Return the number of frames."""
         return recorded_tracks.tracks_window(scenario).count
@@ -74,6 +62,7 @@ class TrackTrafficSource:
             warnings,
             recorded.unknown_boxes(),
             recorded.coverage,
+            recorded.tracks.report.shared_names,
         )
 
     def for_new(self, options: RecordingOptions) -> NewTraffic:

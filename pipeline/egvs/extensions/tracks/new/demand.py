@@ -23,7 +23,6 @@ from egvs.core.wording import number_of
 from egvs.creation import junctions, scenario_files
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.extensions.tracks import demand as track_demand
-from egvs.extensions.tracks.alignment import Alignment
 from egvs.extensions.tracks.cleaning import CleanTracks
 from egvs.extensions.tracks.demand import Passage
 from egvs.extensions.tracks.new.fleet import VEHICLE_CLASSES, KindEstimate, estimate_fleet
@@ -31,6 +30,7 @@ from egvs.extensions.tracks.new.motion import MatchedRecording
 from egvs.scenario.traffic_config import CountConfig
 from egvs.statistics import intervals
 from egvs.statistics.intervals import MIN_OBSERVATIONS
+from egvs.traffic.lane_alignment import Alignment
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import CAR, Network
 

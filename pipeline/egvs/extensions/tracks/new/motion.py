@@ -17,17 +17,17 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.creation.junctions import Streets
-from egvs.extensions.tracks import alignment as track_alignment
 from egvs.extensions.tracks import cleaning, recorded_tracks, resampling
 from egvs.extensions.tracks import matching as track_matching
-from egvs.extensions.tracks.alignment import Alignment
 from egvs.extensions.tracks.cleaning import CleanTracks
 from egvs.extensions.tracks.matching import MatchedTracks
 from egvs.extensions.tracks.new.files import TrackFiles
 from egvs.extensions.tracks.new.fleet import VEHICLE_CLASSES
 from egvs.extensions.tracks.new.signal_assignment import Crossing, RecordedMotion, RecordedPeople
 from egvs.extensions.tracks.resampling import ResampledTracks
+from egvs.traffic import lane_alignment
 from egvs.traffic.class_sizes import CLASS_SIZES
+from egvs.traffic.lane_alignment import Alignment
 from egvs.traffic.network import Network
 
 _MAX_GAP_S = 2.0
@@ -67,7 +67,7 @@ class MatchedRecording:
     def alignment(self) -> Alignment | None:
         """How well moving vehicles fit the lanes."""
         moves = self.boxes.speed_m_s > cleaning.MOVING_M_S
-        return track_alignment.align(np.column_stack([self.boxes.x_m, self.boxes.y_m])[moves], self.network)
+        return lane_alignment.align(np.column_stack([self.boxes.x_m, self.boxes.y_m])[moves], self.network)
 
     def motion(self) -> RecordedMotion:
         """Return when vehicles pass stop lines, and where people walk."""

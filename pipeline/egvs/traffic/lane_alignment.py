@@ -144,18 +144,6 @@ def lane_points(roads: Network, region: Roi) -> FloatArray:
     return points_inside_m
 
 
-def road_heights(roads: Network, xy_m: FloatArray) -> FloatArray:
-    """Return the height of the nearest lane for cars below each position (n, 2), z in the world frame, (n,)."""
-    lines_m = [lane.shape_m for edge in roads.edges for lane in edge.lanes if lane.permission.admits(CAR)]
-    has_heights = any(line_m[:, 2].any() for line_m in lines_m)
-    if not has_heights or not len(xy_m):
-        return np.zeros(len(xy_m))
-    points_m = np.concatenate([_divide(line_m) for line_m in lines_m])
-    _, nearest = KDTree(points_m[:, :2]).query(xy_m)
-    heights_m: FloatArray = points_m[nearest, 2]
-    return heights_m
-
-
 def _divide(line_m: FloatArray) -> FloatArray:
     """Return points every :data:`_SPACING_M` on a line (n, 2) or (n, 3)."""
     return polylines.points_at(line_m, np.arange(0.0, polylines.stations_m(line_m)[-1], _SPACING_M))

@@ -1,0 +1,390 @@
+"""Compare recorded vehicles with the roads: FCD files and tracks alike.
+
+Wrong coordinates, another convention of angles, a mirrored map or shared names give a complete result that is wrong.
+Four things are counted, of motor vehicles in and around the region of interest:
+
+- *off their lanes*: positions of moving vehicles more than :data:`BESIDE_M` beside every lane that leads their way, to
+  :data:`SAME_WAY_DEG`. Beyond the region of interest, only positions within the bounds of all lanes count: a network
+  may end there. In a network without lanes inside junctions, a junction is a lane in all directions;
+- *against the lanes*: positions on lanes that all lead the other way, outside of junctions;
+- *headings*: headings that are more than :data:`ACROSS_DEG` off the motion;
+- *shared names*: rows of one vehicle at one time in two places, and steps that no vehicle can make.
+
+A vehicle moves if it is at least :data:`MIN_MOTION_M` away after :data:`BASE_S`, and faster than :data:`MOVING_M_S`.
+Real traffic has some of each: drivers overtake, turn round, cross car parks, and roads are missing in maps. So a small
+share is nothing, a larger one is a warning, and one that no traffic has is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from egvs.core.errors import Diagnostic
+from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.wording import format_percent, number_of
+from egvs.traffic import lane_alignment
+from egvs.traffic.lane_alignment import Alignment
+from egvs.traffic.network import Network
+from egvs.traffic.road_lanes import RoadLanes
+
+AROUND_M = 50.0
+"""Vehicles farther from the region of interest than this do not count."""
+
+BASE_S, MIN_MOTION_M, MOVING_M_S = 0.5, 1.0, 1.5
+"""Over this time, and at least this distance, motion is measured; slower vehicles do not count."""
+
+MAX_BASE_S = 5.0
+"""Over longer times, a vehicle may have turned several times."""
+
+MAX_TURN_DEG = 30.0
+"""Where a heading changes by more, the motion in between says little about it."""
+
+BESIDE_M = 1.0
+"""A front that is no more than this beside a lane is on it: drivers keep to a side, and maps are inexact."""
+
+SAME_WAY_DEG = 45.0
+"""A lane leads the way of a vehicle if its direction is no farther off the motion than this."""
+
+AGAINST_DEG = 120.0
+"""A lane leads the other way if its direction is farther off the motion than this."""
+
+ACROSS_DEG = 45.0
+"""A heading that is farther off the motion than this is wrong."""
+
+MAX_SPEED_M_S, MIN_JUMP_M = 60.0, 2.0
+"""A step is a jump if it is longer than this distance and this speed allow."""
+
+WARN_SHARE = 0.1
+"""Share of positions against the lanes, or of headings off the motion, that gets a warning."""
+
+WARN_OFF_SHARE = 0.2
+"""Share of positions off their lanes that gets a warning."""
+
+ERROR_SHARE = 0.4
+"""Share of positions off their lanes and against lanes together that is an error. In a recording of a real junction it
+is 7 %; moved by 7 m across its main road 49 %, mirrored 63 to 75 %."""
+
+ERROR_SHIFTED_SHARE = 0.25
+"""The same share, where a shift brings at least this share of the positions more onto lanes."""
+
+ERROR_AGAINST_SHARE = 0.25
+"""Share of positions against the lanes that is an error."""
+
+ERROR_HEADING_SHARE = 0.25
+"""Share of headings off the motion that is an error."""
+
+WARN_HEADING_DEG, ERROR_HEADING_DEG = 10.0, 20.0
+"""Median of the headings off the motion that gets a warning, and that is an error: all are turned by some angle."""
+
+MIN_POSITIONS = 20
+"""Shares of fewer positions are only warnings."""
+
+ERROR_SHARED_SHARE = 0.01
+"""Share of rows whose vehicle is in another place at the same time that is an error; of jumps, it gets a warning."""
+
+ERROR_JUMP_SHARE = 0.1
+"""Share of rows to which a vehicle jumps that is an error."""
+
+_MAX_POSITIONS = 4000
+"""Positions of each table that are compared with lanes."""
+
+
+@dataclass
+class SharedNames:
+    """Signs that two vehicles share a name.
+
+    Attributes
+    ----------
+    rows
+        Number of rows.
+    repeated
+        Rows of a vehicle at a time at which it has another row, elsewhere.
+    jumps
+        Steps between two rows of a vehicle that are longer than any vehicle can move.
+    example
+        One of the vehicles, and when.
+    """
+
+    rows: int = 0
+    repeated: int = 0
+    jumps: int = 0
+    example: str = ""
+
+    def findings(self, where: str) -> Iterator[Diagnostic]:
+        """Yield an error if so many rows are concerned that vehicles are missing, or a warning."""
+        hint = "Give each vehicle a name of its own."
+        if self.repeated:
+            problem = (
+                f"expected one row for each vehicle and time, got {self.repeated:,} others in"
+                f" {number_of(self.rows, 'row')}, in other places ({self.example}): two vehicles share a name"
+            )
+            yield Diagnostic("shared names", where, problem, hint, self.repeated > ERROR_SHARED_SHARE * self.rows)
+        elif self.jumps > ERROR_SHARED_SHARE * self.rows:
+            problem = (
+                f"vehicles jump in {self.jumps:,} of {number_of(self.rows, 'row')}, faster than {MAX_SPEED_M_S:g} m/s:"
+                " two vehicles share a name, or times are wrong"
+            )
+            yield Diagnostic("jumps", where, problem, hint, self.jumps > ERROR_JUMP_SHARE * self.rows)
+
+
+@dataclass
+class RoadCheck:
+    """Counts vehicles that do not fit the roads, table by table.
+
+    Attributes
+    ----------
+    roads
+        The network; None without one, then only headings and names are checked.
+    region
+        The region of interest.
+    motor_types
+        Vehicle types of motor vehicles; others do not count.
+    positions, off_lanes, against
+        Positions of moving vehicles, those off their lanes, and of the others those against the lanes.
+    beside_m
+        Distance of those off their lanes from the nearest lane that leads their way, at most :data:`AROUND_M`, of each
+        table.
+    headings, across
+        Headings of moving vehicles, and those off their motion.
+    off_motion_deg
+        By how much each heading is off its motion, 0 to 180, of each table.
+    names
+        Signs of shared names.
+    """
+
+    roads: Network | None
+    region: Roi
+    motor_types: frozenset[str]
+    positions: int = 0
+    off_lanes: int = 0
+    against: int = 0
+    beside_m: list[FloatArray] = field(default_factory=list)
+    headings: int = 0
+    across: int = 0
+    off_motion_deg: list[FloatArray] = field(default_factory=list)
+    names: SharedNames = field(default_factory=SharedNames)
+
+    def __post_init__(self) -> None:
+        self._lanes = None if self.roads is None else RoadLanes(self.roads)
+        edges = () if self.roads is None else self.roads.all_edges
+        self._has_junction_lanes = any(edge.function == "internal" for edge in edges)
+        self._positions_m: list[FloatArray] = []
+
+    def add(self, table: pa.Table) -> None:
+        """Count the rows of a table of :data:`egvs.traffic.fcd.FCD_SCHEMA`."""
+        import pyarrow.compute as pc
+
+        names = table["id"].combine_chunks().dictionary_encode()
+        is_motor = pc.is_in(table["type"], pa.array(sorted(self.motor_types), pa.string())).to_numpy()
+        vehicle, time_ms = names.indices.to_numpy().astype(np.int64), table["time_ms"].to_numpy()
+        xy_m = np.column_stack([table["x"].to_numpy(), table["y"].to_numpy()])
+        order = np.lexsort((time_ms, vehicle))
+        vehicle, time_ms, xy_m = vehicle[order], time_ms[order], xy_m[order]
+        yaw_rad, is_motor = np.deg2rad(90.0 - table["angle"].to_numpy()[order]), is_motor[order]
+        self._count_shared(names.dictionary, vehicle, time_ms, xy_m)
+
+        first, second, motion_m = _motions(vehicle, time_ms, xy_m)
+        counts = is_motor[first] & self._is_around(xy_m[first], AROUND_M)
+        first, second, motion_m = first[counts], second[counts], motion_m[counts]
+        motion_rad = np.arctan2(motion_m[:, 1], motion_m[:, 0])
+        self._count_headings(yaw_rad[first], yaw_rad[second], motion_rad)
+        if self._lanes is not None and len(self._lanes):
+            covered = self._is_around(xy_m[first], 0.0) | _is_inside(xy_m[first], *self._lanes.bounds_m)
+            first, motion_rad = first[covered], motion_rad[covered]
+            if len(first) > _MAX_POSITIONS:
+                chosen = np.sort(np.random.default_rng(0).choice(len(first), _MAX_POSITIONS, replace=False))
+                first, motion_rad = first[chosen], motion_rad[chosen]
+            self._count_positions(self._lanes, xy_m[first], motion_rad)
+
+    def _is_around(self, xy_m: FloatArray, margin_m: float) -> NDArray[np.bool_]:
+        low_m = np.array(self.region.origin_m[:2])
+        return _is_inside(xy_m, low_m - margin_m, low_m + self.region.size_m[:2] + margin_m)
+
+    def _count_shared(self, names: pa.Array, vehicle: IntArray, time_ms: IntArray, xy_m: FloatArray) -> None:
+        same = np.diff(vehicle) == 0
+        step_ms = np.diff(time_ms)
+        distance_m = np.hypot(*np.diff(xy_m, axis=0).T)
+        repeated = np.flatnonzero(same & (step_ms == 0) & (distance_m > MIN_JUMP_M))
+        jumps = same & (step_ms > 0) & (distance_m > MIN_JUMP_M) & (distance_m > MAX_SPEED_M_S * step_ms / 1000.0)
+        self.names.rows += len(vehicle)
+        self.names.repeated += len(repeated)
+        self.names.jumps += int(jumps.sum())
+        if len(repeated) and not self.names.example:
+            row = repeated[0]
+            self.names.example = f"{names[int(vehicle[row])].as_py()!r} at {time_ms[row] / 1000.0:g} s"
+
+    def _count_headings(self, first_rad: FloatArray, second_rad: FloatArray, motion_rad: FloatArray) -> None:
+        turn_rad = _wrap(second_rad - first_rad)
+        is_steady = np.abs(turn_rad) <= np.deg2rad(MAX_TURN_DEG)
+        off_rad = _wrap(first_rad + turn_rad / 2.0 - motion_rad)[is_steady]
+        off_deg = np.rad2deg(np.abs(off_rad))
+        self.headings += len(off_deg)
+        self.across += int((off_deg > ACROSS_DEG).sum())
+        self.off_motion_deg.append(off_deg)
+
+    def _count_positions(self, lanes: RoadLanes, xy_m: FloatArray, motion_rad: FloatArray) -> None:
+        in_junction = lanes.in_junctions(xy_m)
+        near = lanes.near(xy_m, BESIDE_M)
+        off_rad = np.abs(_wrap(motion_rad[near.row] - near.yaw_rad))
+        on_lane = _mark(near.row, len(xy_m))
+        leads_on = _mark(near.row[off_rad <= np.deg2rad(SAME_WAY_DEG)], len(xy_m))
+        leads_elsewhere = _mark(near.row[off_rad <= np.deg2rad(AGAINST_DEG)], len(xy_m))
+        against = on_lane & ~leads_elsewhere & ~in_junction
+        off_lanes = ~leads_on & ~against
+        if not self._has_junction_lanes:
+            off_lanes &= ~in_junction
+        self.positions += len(xy_m)
+        self.off_lanes += int(off_lanes.sum())
+        self.against += int(against.sum())
+        self.beside_m.append(_distances_m(lanes, xy_m[off_lanes], motion_rad[off_lanes]))
+        self._positions_m.append(xy_m if self._has_junction_lanes else xy_m[~in_junction])
+
+    def alignment(self) -> Alignment | None:
+        """Compare the positions with the lanes, and find a shift that fits better; None without positions or lanes."""
+        if self.roads is None or not self._positions_m:
+            return None
+        return lane_alignment.align(np.concatenate(self._positions_m), self.roads)
+
+    def findings(self, where: str) -> Iterator[Diagnostic]:
+        """Yield errors and warnings.
+
+        Parameters
+        ----------
+        where
+            Key of the file, for messages.
+        """
+        yield from self.names.findings(where)
+        yield from self._heading_findings(where)
+        yield from self._position_findings(where)
+
+    def _heading_findings(self, where: str) -> Iterator[Diagnostic]:
+        if not self.headings:
+            return
+        median_deg = float(np.median(np.concatenate(self.off_motion_deg)))
+        if self.across <= WARN_SHARE * self.headings and median_deg <= WARN_HEADING_DEG:
+            return
+        problem = (
+            f"{format_percent(self.across / self.headings, 0)} of {number_of(self.headings, 'heading')} of moving"
+            f" vehicles are more than {ACROSS_DEG:g} degrees off their motion (median of all {median_deg:.0f} degrees)"
+        )
+        hint = "Check the angles: FCD has degrees clockwise from north, tracks counter-clockwise from x."
+        is_error = self._is_error(self.across, self.headings, ERROR_HEADING_SHARE)
+        is_error |= self.headings >= MIN_POSITIONS and median_deg > ERROR_HEADING_DEG
+        yield Diagnostic("headings", where, problem, hint, is_error)
+
+    def _position_findings(self, where: str) -> Iterator[Diagnostic]:
+        alignment = self.alignment()
+        if alignment is None:
+            return
+        misplaced = self.off_lanes + self.against
+        is_shifted = alignment.fitted_share - alignment.share >= ERROR_SHIFTED_SHARE
+        share = ERROR_SHIFTED_SHARE if is_shifted else ERROR_SHARE
+        hint = "Check the coordinate system, and whether vehicles and network show the same place."
+        if self.off_lanes > WARN_OFF_SHARE * self.positions:
+            is_error = self._is_error(misplaced, self.positions, share)
+            distance_m = np.median(np.concatenate(self.beside_m))
+            problem = (
+                f"{format_percent(self.off_lanes / self.positions, 0)} of {number_of(self.positions, 'position')} of"
+                f" moving vehicles are more than {BESIDE_M:g} m beside every lane that leads their way (median"
+                f" {distance_m:.1f} m)"
+            )
+            problem += f"; {alignment.describe()}"
+            yield Diagnostic("vehicles off their lanes", where, problem, hint, is_error)
+        else:
+            yield from alignment.warnings(where)
+        if self.against > WARN_SHARE * self.positions:
+            problem = (
+                f"{format_percent(self.against / self.positions, 0)} of {number_of(self.positions, 'position')} of"
+                " moving vehicles are on lanes that lead the other way"
+            )
+            hint = "Check that the map is not mirrored, the side of driving, and the order of times."
+            is_error = self._is_error(self.against, self.positions, ERROR_AGAINST_SHARE)
+            yield Diagnostic("vehicles against lanes", where, problem, hint, is_error)
+
+    @staticmethod
+    def _is_error(number: int, of: int, share: float) -> bool:
+        return of >= MIN_POSITIONS and number > share * of
+
+
+def check_tables(
+    tables: Iterable[pa.Table],
+    roads: Network | None,
+    region: Roi,
+    motor_types: frozenset[str],
+    names: SharedNames | None = None,
+) -> RoadCheck:
+    """Count the vehicles of some tables that do not fit the roads.
+
+    Parameters
+    ----------
+    tables
+        Rows of :data:`egvs.traffic.fcd.FCD_SCHEMA`, in order of time.
+    roads
+        The network; None without one.
+    region
+        The region of interest.
+    motor_types
+        Vehicle types of motor vehicles.
+    names
+        Signs of shared names, where they were found before and the tables have no such rows any more.
+    """
+    check = RoadCheck(roads, region, motor_types)
+    for table in tables:
+        if table.num_rows:
+            check.add(table)
+    if names is not None:
+        check.names = names
+    return check
+
+
+def _motions(vehicle: IntArray, time_ms: IntArray, xy_m: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return pairs of rows between which a vehicle moves, and its motion (n, 2); rows are by vehicle, then time."""
+    steps_ms = np.diff(time_ms)[np.diff(vehicle) == 0]
+    steps_ms = steps_ms[steps_ms > 0]
+    if not len(steps_ms):
+        none = np.empty(0, dtype=np.int64)
+        return none, none, np.empty((0, 2))
+    lag = max(1, int(np.ceil(BASE_S * 1000.0 / np.median(steps_ms))))
+    first = np.arange(len(vehicle) - lag)
+    second = first + lag
+    motion_m = xy_m[second] - xy_m[first]
+    duration_s = (time_ms[second] - time_ms[first]) / 1000.0
+    distance_m = np.hypot(*motion_m.T)
+    same_vehicle: NDArray[np.bool_] = vehicle[second] == vehicle[first]
+    moves = same_vehicle & (duration_s > 0.0) & (duration_s <= MAX_BASE_S)
+    moves &= (distance_m >= MIN_MOTION_M) & (distance_m > MOVING_M_S * duration_s)
+    moves &= distance_m <= np.maximum(MAX_SPEED_M_S * duration_s, MIN_JUMP_M)
+    return first[moves], second[moves], motion_m[moves]
+
+
+def _is_inside(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> NDArray[np.bool_]:
+    """Return whether positions (n, 2) are in a rectangle, (n,)."""
+    inside: NDArray[np.bool_] = np.all((xy_m >= low_m) & (xy_m <= high_m), axis=1)
+    return inside
+
+
+def _mark(rows: IntArray, count: int) -> NDArray[np.bool_]:
+    """Return which of ``count`` rows are among ``rows``."""
+    marked = np.zeros(count, dtype=np.bool_)
+    marked[rows] = True
+    return marked
+
+
+def _distances_m(lanes: RoadLanes, xy_m: FloatArray, motion_rad: FloatArray) -> FloatArray:
+    """Return the distance of positions (n, 2) from the nearest lane that leads their way, at most :data:`AROUND_M`."""
+    distance_m = np.full(len(xy_m), AROUND_M)
+    near = lanes.near(xy_m, AROUND_M)
+    same_way = np.abs(_wrap(motion_rad[near.row] - near.yaw_rad)) <= np.deg2rad(SAME_WAY_DEG)
+    np.minimum.at(distance_m, near.row[same_way], near.distance_m[same_way])
+    return distance_m
+
+
+def _wrap(angle_rad: FloatArray) -> FloatArray:
+    """Return angles from -pi to pi."""
+    wrapped: FloatArray = np.mod(angle_rad + np.pi, 2.0 * np.pi) - np.pi
+    return wrapped
