@@ -347,7 +347,7 @@ def _check_terrain(inputs: CheckInputs, reference: Reference) -> Iterator[Diagno
 def compare_traffic(
     inputs: CheckInputs, carriageway: Carriageway | None, traffic_m: FloatArray, where: str
 ) -> Iterator[Diagnostic]:
-    """Report vehicles whose heights have another zero than the lanes, or else than the ground and the region.
+    """Report vehicles whose heights have another zero than the lanes, or else than the ground and the solids.
 
     Parameters
     ----------
@@ -367,12 +367,6 @@ def compare_traffic(
         yield from _compare_with_lanes(carriageway, traffic_m, where)
         return
     z_m = float(np.median(traffic_m[:, 2]))
-    box = inputs.scenario.roi.box
-    low_m, high_m = box.origin_m[2], box.origin_m[2] + box.size_m[2]
-    if z_m > high_m or z_m + clearances.CLEARANCE_M < low_m:
-        problem = f"the region extends from z = {low_m:g} to {high_m:g} m, but vehicles drive at z = {z_m:,.1f} m"
-        hint = "Set center_m to the height of the traffic."
-        yield Diagnostic(RULE, f"{inputs.scenario.file}: roi", problem, hint, is_error=True)
     if inputs.world is None:
         return
     if inputs.scenario.statics.ground and abs(z_m) > MARGIN_M and not _is_on_solids(inputs.world, traffic_m):
