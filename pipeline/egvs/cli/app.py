@@ -102,14 +102,12 @@ def run(
     stage_options = {"score": {"audit": True}} if audit else None
     with ProgressDisplay("run", with_details=verbose) as screen:
         from egvs.cli import answer, run_tables
-        from egvs.runs import digest_cache
-        from egvs.runs.run import run
+        from egvs.runs.run import run, run_rehashed
 
         loaded, folder = _load(scenario, cli_options.with_detector(set_, detector), out)
         screen.flow_source = answer.flow_source(loaded)
-        if rehash:
-            digest_cache.forget_digests(folder)
-        record = run(
+        run_all = run_rehashed if rehash else run
+        record = run_all(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
     if not screen.any_stage_ran:

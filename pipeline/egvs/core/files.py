@@ -18,9 +18,10 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from egvs.core import platform
 from egvs.core.errors import InputError
@@ -55,10 +56,38 @@ def atomic_write(path: Path) -> Iterator[Path]:
     try:
         with attach_filename(path):
             yield partial
+        written = _WRITTEN.get()
+        if written is not None and path.parent == written.folder:
+            written.digests[path.name] = hash_file(partial)
         partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+class _WrittenFiles(NamedTuple):
+    """Digests of the files that were written in a folder, by name."""
+
+    folder: Path
+    digests: dict[str, str]
+
+
+_WRITTEN: ContextVar[_WrittenFiles | None] = ContextVar("_WRITTEN", default=None)
+
+
+@contextmanager
+def hash_written_files(folder: Path) -> Iterator[dict[str, str]]:
+    """Yield the SHA-256 of each file, by name, that the block writes in a folder with :func:`atomic_write`.
+
+    A file is hashed before it gets its name, so that the digest is that of what was written, even if another program
+    replaces the file at once.
+    """
+    written = _WrittenFiles(folder, {})
+    token = _WRITTEN.set(written)
+    try:
+        yield written.digests
+    finally:
+        _WRITTEN.reset(token)
 
 
 @contextmanager

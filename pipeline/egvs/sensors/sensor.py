@@ -25,6 +25,7 @@ from __future__ import annotations
 import csv
 import difflib
 import hashlib
+import io
 import math
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -36,7 +37,7 @@ import numpy as np
 from pydantic import Field
 
 from egvs.core import files, limits
-from egvs.core.digests import hash_input
+from egvs.core.digests import hash_input, open_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import number_or_nan, parse_decimal
@@ -131,7 +132,7 @@ def _read_cached(path: Path, _content_hash: str) -> BeamTable:
     max_beams = limits.BEAMS.maximum
     limits.checked_size(path, limits.FILE)
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with open_input(path) as content, io.TextIOWrapper(content, "utf-8-sig", newline="") as file:
             rows = csv.DictReader(file, skipinitialspace=True)
             names = list(rows.fieldnames or ())
             _check_beam_columns(path, names)

@@ -25,6 +25,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from egvs.core import limits, reading
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.wording import number_of
 from egvs.formats import xml
@@ -201,7 +202,8 @@ def _open_seekable(path: Path) -> Iterator[Any]:
             plain.seek(0)
             yield plain
     else:
-        yield path
+        with open_input(path) as file:
+            yield file
 
 
 def fcd_metadata(path: Path) -> bytes | None:
