@@ -31,6 +31,9 @@ DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
 
 _TEMP_PREFIX, _MAX_ATTEMPTS = "egvs-work-", 10
 
+_MIN_FREE_BYTES, _MIN_FREE_BYTES_AFTER_ERROR = 4096, 1_000_000
+"""What a disk must still take that is not full; after an error, a library may have removed part of what it wrote."""
+
 
 @contextmanager
 def attach_filename(path: Path) -> Iterator[None]:
@@ -44,6 +47,50 @@ def attach_filename(path: Path) -> Iterator[None]:
         if error.errno in DISK_FULL_ERRNOS and (error.filename is None or error.filename2 is not None):
             error.filename, error.filename2 = str(path), None
         raise
+
+
+def check_utf8(where: str, name: str) -> None:
+    """Check that the name of a file is UTF-8: records and artefacts contain names.
+
+    Raises
+    ------
+    InputError
+        At ``where``, when it is not.
+    """
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        raise InputError(where, f"expected a name in UTF-8, got {name!r}", "Rename the file or the folder.") from None
+
+
+@contextmanager
+def check_disk_space(folder: Path, *errors: type[Exception]) -> Iterator[None]:
+    """Raise the error of a full disk where another library, which writes to a folder, raises its own, or none at all.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    *errors
+        What the library raises.
+
+    Raises
+    ------
+    OSError
+        When the folder cannot take more.
+    """
+    try:
+        yield
+    except errors:
+        _write_probe(folder, _MIN_FREE_BYTES_AFTER_ERROR)
+        raise
+    _write_probe(folder, _MIN_FREE_BYTES)
+
+
+def _write_probe(folder: Path, n_bytes: int) -> None:
+    with attach_filename(folder), tempfile.TemporaryFile(dir=folder) as file:
+        file.write(b"0" * n_bytes)
+        file.flush()
 
 
 @contextmanager

@@ -25,6 +25,7 @@ from egvs._version import __version__
 from egvs.artefacts.origin import foreign_files
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
+from egvs.core import files
 from egvs.core.digests import use_digests
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.platform import relative_path
@@ -144,7 +145,10 @@ def _start_run(
     is_rehash: bool = False,
 ) -> Iterator[_Run]:
     """Lock a run folder, and yield the run in it."""
+    if out == "":
+        raise InputError("out", "expected a folder, got an empty text", 'Use "." for the current folder.')
     folder = Path(out) if out is not None else default_folder(scenario)
+    files.check_utf8("the run folder", str(folder.absolute()))
     check_no_overwrite(scenario, folder)
     with lock_run_folder(folder, wait_s), remember_digests(RunFolder(folder), trusted=not is_rehash) as digests:
         context = open_context(folder, digests=digests)
