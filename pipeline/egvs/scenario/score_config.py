@@ -59,6 +59,10 @@ _GAMMA_AT_1_M, _GAMMA_EXPONENT = 10.0, 1.16
 0.25, 0.5 and 1 m; 1, 2 and 5 with moving occlusion. It interpolates three values each, measured with one sensor."""
 
 
+MIN_GAMMA, MAX_GAMMA = 1e-9, 1e12
+"""Smallest and largest gamma between 0 and infinity."""
+
+
 def default_gamma(voxel_m: float, *, moving_occlusion: bool) -> float:
     r"""Return the gamma that ``"auto"`` stands for, to two significant digits.
 
@@ -184,6 +188,14 @@ class ScoreConfig(StrictModel):
     def _parse_inf(cls, gamma: Any) -> Any:
         """JSON has no infinity: it is written as text."""
         return math.inf if gamma == "inf" else gamma
+
+    @field_validator("gamma")
+    @classmethod
+    def _check_gamma(cls, gamma: float | str) -> float | str:
+        """Squares of scores, which standard errors need, are numbers only within these limits."""
+        if isinstance(gamma, float) and 0.0 < gamma < math.inf and not MIN_GAMMA <= gamma <= MAX_GAMMA:
+            raise ValueError(f"expected 0, a number from {MIN_GAMMA:g} to {MAX_GAMMA:g}, or inf, got {gamma:g}")
+        return gamma
 
     @field_validator("others")
     @classmethod

@@ -320,6 +320,12 @@ class Sensor:
         # Written out: a BLAS may sum in another order on another machine.
         return rays[:, :1] * matrix[:, 0] + rays[:, 1:2] * matrix[:, 1] + rays[:, 2:] * matrix[:, 2]
 
+    @property
+    def beam_table(self) -> BeamTable:
+        """All beams in order, as a table."""
+        elevation, azimuth = np.broadcast_arrays(*self._angles_deg(0.0))
+        return BeamTable(elevation.ravel(), azimuth.ravel())
+
     def _angles_deg(self, yaw_deg: float) -> tuple[FloatArray, FloatArray]:
         """Elevations and azimuths that broadcast to all beams in order, turned by ``yaw_deg``."""
         azimuth: FloatArray
