@@ -168,7 +168,7 @@ class Digests:
         InputError
             When a file was changed or replaced, even if it was replaced by the original in the end.
         """
-        for name, path in (self._collected if paths is None else paths).copy().items():
+        for name, path in list((self._collected if paths is None else paths).items()):
             if name in self._digests and name not in self._contents and not self._is_unchanged(name):
                 raise _changed_error(path)
 

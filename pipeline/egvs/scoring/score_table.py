@@ -311,8 +311,8 @@ def warn_blind_sites(column: ScoreColumn, sites: Sequence[str], returned_shares:
     """
     if not np.any(column.values > 0):
         return  # warn_all_zero
-    blind = np.flatnonzero(column.values == 0)
-    if not len(blind):
+    blind = np.flatnonzero(column.values == 0).tolist()
+    if not blind:
         return
     listed = list_first([f"{sites[i]} ({100 * returned_shares[i]:.0f} %)" for i in blind], _MAX_LISTED_SITES)
     problem = f"{column.name} is 0 at {listed}; in brackets, the beams that end on the static world"
