@@ -169,7 +169,7 @@ MOST_LINES = {
     "statics": 9_500,
     "scan": 11_300,
     "traffic": 9_800,
-    "tpog": 4_000,
+    "tpog": 4_100,
     "score": 16_000,
     "report": 19_100,
 }

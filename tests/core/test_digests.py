@@ -85,7 +85,7 @@ def test_expected_digest_is_that_of_what_was_written(tmp_path: Path) -> None:
     with files.hash_written_files(tmp_path) as written:
         files.write_text(path, "one")
         files.write_text(tmp_path / "folder" / "b", "two")
-    assert written == {"a": sha256(b"one")}
+    assert written == {"a": sha256(b"one"), "folder/b": sha256(b"two")}
     path.write_bytes(b"two")
     current = Digests(tmp_path)
     current.expect({path: written["a"]})

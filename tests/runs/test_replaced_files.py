@@ -18,6 +18,7 @@ import egvs
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.runs.stage_registry import STAGE_MODULES
+from egvs.traffic.sumo_folder import NETWORK_FILE
 from tests.conftest import write_mini
 
 CHANGED = "was changed while it was in use"
@@ -157,6 +158,20 @@ def test_large_input_replaced_while_a_stage_works(
     )
     with pytest.raises(InputError, match=f"fcd.csv: {CHANGED}"):
         egvs.run(egvs.load(mini), tmp_path / "out")
+
+
+def test_network_replaced_while_sumo_reads_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = ['traffic.hold="at_most"', "traffic.frames=20", "traffic.warmup_s=5", "tpog.blocks=2", "roi.voxel_m=1"]
+    roundabout = Path(__file__).parents[2] / "scenarios" / "roundabout"
+
+    def replace_network(folder: Path) -> None:
+        network = folder / "sumo" / NETWORK_FILE
+        network.write_text(network.read_text(encoding="utf-8").replace('speed="13.89"', 'speed="8.33"', 1) + "\n")
+
+    at_end_of("traffic", monkeypatch, replace_network)
+    with pytest.raises(InputError, match=f"{NETWORK_FILE}: {CHANGED}"):
+        egvs.run(egvs.load(roundabout, settings), tmp_path / "out")
+    assert not (tmp_path / "out" / "tpog.parquet").exists()
 
 
 def test_new_link_to_an_artefact_is_no_change(runs: TwoRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,8 +104,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
         with attach_filename(path):
             yield partial
         written = _WRITTEN.get()
-        if written is not None and path.parent == written.folder:
-            written.digests[path.name] = hash_file(partial)
+        if written is not None and path.is_relative_to(written.folder):
+            written.digests[path.relative_to(written.folder).as_posix()] = hash_file(partial)
         partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
@@ -113,7 +113,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 class _WrittenFiles(NamedTuple):
-    """Digests of the files that were written in a folder, by name."""
+    """Digests of the files that were written in a folder, by path in the folder."""
 
     folder: Path
     digests: dict[str, str]
@@ -124,7 +124,7 @@ _WRITTEN: ContextVar[_WrittenFiles | None] = ContextVar("_WRITTEN", default=None
 
 @contextmanager
 def hash_written_files(folder: Path) -> Iterator[dict[str, str]]:
-    """Yield the SHA-256 of each file, by name, that the block writes in a folder with :func:`atomic_write`.
+    """Yield the SHA-256 of each file, by path in a folder, that the block writes there with :func:`atomic_write`.
 
     A file is hashed before it gets its name, so that the digest is that of what was written, even if another program
     replaces the file at once.

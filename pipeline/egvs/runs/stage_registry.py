@@ -12,7 +12,7 @@ from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core import files
 from egvs.core.digests import use_digests
-from egvs.core.errors import with_relative_paths
+from egvs.core.errors import InputError, with_relative_paths
 from egvs.core.resource_usage import ResourceUsage, measure_usage
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 
@@ -103,8 +103,11 @@ def run_stage(name: str, context: StageContext, dependencies: StageDependencies,
     context.expect(artefacts)
     companions = {}
     for companion, stamp in sorted(_sidecar_stat(running, folder).items()):
-        if stamps_before.get(companion) != stamp:
-            companions[companion] = files.hash_file(context.path(companion))
+        if stamps_before.get(companion) == stamp:
+            continue
+        companions[companion] = files.hash_file(context.path(companion))
+        if companions[companion] != written.get(companion, companions[companion]):
+            raise InputError(context.path(companion), "was changed while it was in use", "Repeat the command.")
     return StageResult(artefacts, companions, summary, cost)
 
 
