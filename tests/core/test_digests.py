@@ -80,6 +80,17 @@ def test_rejects_file_that_is_not_held_and_differs_from_its_digest(
         current.open(path)
 
 
+def test_rejects_artefact_that_is_not_the_recorded_one_when_it_is_opened(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
+    current = Digests(tmp_path, recorded={path: sha256(b"two")})
+    with pytest.raises(InputError, match="was altered or replaced"):
+        current.open(path)
+    path.write_bytes(b"two")
+    with current.open(path) as file:
+        assert file.read() == b"two"
+
+
 def test_expected_digest_is_that_of_what_was_written(tmp_path: Path) -> None:
     path = tmp_path / "a"
     with files.hash_written_files(tmp_path) as written:

@@ -17,6 +17,7 @@ import pytest
 import egvs
 from egvs.core import files
 from egvs.core.errors import InputError
+from egvs.placement import plan
 from egvs.runs.stage_registry import STAGE_MODULES
 from egvs.traffic.sumo_folder import NETWORK_FILE
 from tests.conftest import write_mini
@@ -178,6 +179,26 @@ def test_new_link_to_an_artefact_is_no_change(runs: TwoRuns, tmp_path: Path, mon
     at_end_of("score", monkeypatch, lambda folder: os.link(folder / "tpog.parquet", tmp_path / "link"))
     egvs.run(egvs.load(runs.folder), tmp_path / "out")
     assert runs.scores(tmp_path / "out") == runs.scores(runs.expected)
+
+
+@pytest.mark.parametrize("artefact", ["scans.parquet", "tpog.parquet"])
+@pytest.mark.parametrize("after", [False, True])
+def test_artefact_replaced_before_or_while_a_plan_is_made(
+    runs: TwoRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, artefact: str, after: bool
+) -> None:
+    original = plan.solve_placement
+    out = tmp_path / "out"
+
+    def solve(context: Any, **options: Any) -> Any:
+        if after:
+            placed = original(context, **options)
+        put_in_place(runs.other / artefact, out / artefact)
+        return placed if after else original(context, **options)
+
+    monkeypatch.setattr(plan, "solve_placement", solve)
+    with pytest.raises(InputError, match=f"{artefact}: was (changed|altered)"):
+        plan.place(egvs.load(runs.folder, ["placement.count=1"]), out)
+    assert not (out / "placement.parquet").exists()
 
 
 def forge(folder: Path, name: str, source: Path) -> None:

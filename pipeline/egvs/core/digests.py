@@ -132,13 +132,14 @@ class Digests:
     def _open_unheld(self, path: Path, name: str) -> io.BufferedReader:
         """Open a file that is not held, and compare what was opened with its digest.
 
-        Nothing is compared for a file that the run writes itself, until its digest is requested.
+        Nothing is compared for a file that the run writes itself, until its digest is known.
         """
         file = path.open("rb")
         try:
             status = os.fstat(file.fileno())
             is_own = self._is_in_folder(name) or files.is_temporary(Path(name))
-            if not stat.S_ISREG(status.st_mode) or (is_own and name not in self._digests):
+            is_known = name in self._digests or name in self._recorded
+            if not stat.S_ISREG(status.st_mode) or (is_own and not is_known):
                 return file
             expected = self.of(path)
             stamp, hashed_ns = _stamp(status), time.time_ns()
