@@ -146,8 +146,8 @@ class ScoreConfig(StrictModel):
 
     gamma: Annotated[float, Field(ge=0, allow_inf_nan=True)] | Literal["auto"] = Field(
         "auto",
-        description="Cap of the beams that count in one voxel; may be inf. 'auto' depends on the size of voxels: "
-        "10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), and half of that with moving_occlusion",
+        description="Cap of the beams that count in one voxel: 0, from 1e-9 to 1e12, or inf. 'auto' depends on the "
+        "size of voxels: 10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), and half of that with moving_occlusion",
     )
     rank_by: Literal["egvs", OtherScore] = Field("egvs", description="Score that sites are ranked by")
     others: tuple[OtherScore, ...] = Field(
