@@ -55,13 +55,13 @@ def test_gamma_of_scenario(auto: Path) -> None:
     assert of("score.gamma=inf") == float("inf")
 
 
-@pytest.mark.parametrize("gamma", ["1e-300", "1e-10", "5e-324", "1e13", "1e300"])
+@pytest.mark.parametrize("gamma", ["1e-300", "1e-10", "5e-324"])
 def test_rejects_gamma_whose_squares_are_no_numbers(auto: Path, gamma: str) -> None:
-    with pytest.raises(InputError, match=r"score.gamma: expected 0, a number from 1e-09 to 1e\+12, or inf, got"):
+    with pytest.raises(InputError, match=r"score\.gamma: expected 0, or at least 1e-09, got"):
         egvs.load(auto, [f"score.gamma={gamma}"])
 
 
-@pytest.mark.parametrize("gamma", [1e-9, 1e12])
+@pytest.mark.parametrize("gamma", [1e-9, 1e12, 1e300])
 def test_errors_of_smallest_and_largest_gamma_are_in_proportion(auto: Path, tmp_path: Path, gamma: float) -> None:
     """The smallest caps every voxel; the largest caps none."""
     relative = []

@@ -59,8 +59,8 @@ _GAMMA_AT_1_M, _GAMMA_EXPONENT = 10.0, 1.16
 0.25, 0.5 and 1 m; 1, 2 and 5 with moving occlusion. It interpolates three values each, measured with one sensor."""
 
 
-MIN_GAMMA, MAX_GAMMA = 1e-9, 1e12
-"""Smallest and largest gamma between 0 and infinity."""
+MIN_GAMMA = 1e-9
+"""Smallest gamma above 0."""
 
 
 def default_gamma(voxel_m: float, *, moving_occlusion: bool) -> float:
@@ -146,7 +146,7 @@ class ScoreConfig(StrictModel):
 
     gamma: Annotated[float, Field(ge=0, allow_inf_nan=True)] | Literal["auto"] = Field(
         "auto",
-        description="Cap of the beams that count in one voxel: 0, from 1e-9 to 1e12, or inf. 'auto' depends on the "
+        description="Cap of the beams that count in one voxel: 0, at least 1e-9, or inf. 'auto' depends on the "
         "size of voxels: 10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), and half of that with moving_occlusion",
     )
     rank_by: Literal["egvs", OtherScore] = Field("egvs", description="Score that sites are ranked by")
@@ -192,9 +192,9 @@ class ScoreConfig(StrictModel):
     @field_validator("gamma")
     @classmethod
     def _check_gamma(cls, gamma: float | str) -> float | str:
-        """Squares of scores, which standard errors need, are numbers only within these limits."""
-        if isinstance(gamma, float) and 0.0 < gamma < math.inf and not MIN_GAMMA <= gamma <= MAX_GAMMA:
-            raise ValueError(f"expected 0, a number from {MIN_GAMMA:g} to {MAX_GAMMA:g}, or inf, got {gamma:g}")
+        """Squares of scores, which standard errors need, are 0 where all scores are tiny."""
+        if isinstance(gamma, float) and 0.0 < gamma < MIN_GAMMA:
+            raise ValueError(f"expected 0, or at least {MIN_GAMMA:g}, got {gamma:g}")
         return gamma
 
     @field_validator("others")
