@@ -169,7 +169,7 @@ MOST_LINES = {
     "statics": 9_800,
     "scan": 11_600,
     "traffic": 10_000,
-    "tpog": 4_000,
+    "tpog": 4_100,
     "score": 16_200,
     "report": 19_100,
 }

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -53,16 +55,111 @@ def test_link_and_file_have_one_content(tmp_path: Path) -> None:
     assert current.open(path).read() == b"one"
 
 
-def test_files_of_the_run_and_large_files_are_read_each_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    artefact, large = tmp_path / "run" / "a", tmp_path / "large"
-    artefact.parent.mkdir()
+def test_files_of_the_run_are_read_each_time(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    current = Digests(tmp_path)
+    for content in (b"one", b"two"):
+        path.write_bytes(content)
+        with current.open(path) as file:
+            assert file.read() == content
+
+
+@pytest.mark.parametrize("in_run_folder", [True, False])
+def test_rejects_file_that_is_not_held_and_differs_from_its_digest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_run_folder: bool
+) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
     monkeypatch.setattr(digests, "MAX_HELD_BYTES", 2)
-    current = Digests(artefact.parent)
-    for path in (artefact, large):
-        for content in (b"one", b"two"):
-            path.write_bytes(content)
-            with current.open(path) as file:
-                assert file.read() == content
+    current = Digests(tmp_path if in_run_folder else None)
+    assert current.of(path) == sha256(b"one")
+    with current.open(path) as file:
+        assert file.read() == b"one"
+    path.write_bytes(b"two")
+    with pytest.raises(InputError, match="was changed while it was in use"):
+        current.open(path)
+
+
+def test_rejects_artefact_that_is_not_the_recorded_one_when_it_is_opened(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
+    current = Digests(tmp_path, recorded={path: sha256(b"two")})
+    with pytest.raises(InputError, match="was altered or replaced"):
+        current.open(path)
+    path.write_bytes(b"two")
+    with current.open(path) as file:
+        assert file.read() == b"two"
+
+
+def test_expected_digest_is_that_of_what_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    with files.hash_written_files(tmp_path) as written:
+        files.write_text(path, "one")
+        files.write_text(tmp_path / "folder" / "b", "two")
+    assert written == {"a": sha256(b"one"), "folder/b": sha256(b"two")}
+    path.write_bytes(b"two")
+    current = Digests(tmp_path)
+    current.expect({path: written["a"]})
+    assert current.of(path) == sha256(b"one")
+    with pytest.raises(InputError, match="was changed"):
+        current.open(path)
+
+
+def replace_and_put_back(path: Path) -> None:
+    status, content = path.stat(), path.read_bytes()
+    path.write_bytes(b"two")
+    other = path.with_name("other")
+    other.write_bytes(content)
+    os.utime(other, ns=(status.st_atime_ns, status.st_mtime_ns))
+    other.replace(path)
+
+
+def write_over_and_set_times_back(path: Path) -> None:
+    status = path.stat()
+    path.write_bytes(b"two")
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+
+def remove(path: Path) -> None:
+    path.unlink()
+
+
+@pytest.mark.parametrize("change", [replace_and_put_back, write_over_and_set_times_back, remove])
+def test_finds_file_that_was_changed_after_it_was_hashed(tmp_path: Path, change: Callable[[Path], None]) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
+    current = Digests(tmp_path)
+    with current.collect() as paths:
+        current.of(path)
+    current.check_unchanged(paths)
+    change(path)
+    for check in (lambda: current.check_unchanged(paths), current.check_unchanged):
+        with pytest.raises(InputError, match="a: was changed while it was in use"):
+            check()
+
+
+def test_finds_file_that_was_changed_while_another_process_read_it(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
+    with use_digests(Digests(tmp_path / "run")), digests.unchanged_inputs(path):
+        path.write_bytes(b"not hashed before")
+    with use_digests(Digests(tmp_path / "run")):
+        hash_input(path)
+        with pytest.raises(InputError, match="was changed"), digests.unchanged_inputs(path):
+            path.write_bytes(b"two")
+
+
+def test_new_link_and_held_content_are_no_change(tmp_path: Path) -> None:
+    linked, held = tmp_path / "linked", tmp_path / "held"
+    linked.write_bytes(b"one")
+    held.write_bytes(b"one")
+    current = Digests(tmp_path / "run")
+    current.of(linked)
+    current.open(held).close()
+    current.of(held)
+    os.link(linked, tmp_path / "link")
+    held.write_bytes(b"two")
+    current.check_unchanged()
 
 
 def test_temporary_files_are_read_and_hashed_each_time(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[exp
 
 from websockets import Headers
 from websockets.http11 import Request
+from websockets.streams import StreamReader
 
 from egvs.explore.access import AccessGuard
 
@@ -107,6 +108,31 @@ def test_requests_without_key_and_cookie_are_refused(guard: AccessGuard, opened:
 def test_long_address_is_refused(guard: AccessGuard, opened: list[dict[str, str]]) -> None:
     assert status(guard, f"/?key={guard.key}&site={'x' * 5000}") == 403
     assert opened == []
+
+
+@pytest.mark.parametrize("path", ["//[", "//[x]/?key=1", "http://[", "/?look=\udcff"])
+def test_address_that_no_browser_sends_is_refused(guard: AccessGuard, path: str) -> None:
+    assert status(guard, path) == 403
+    assert status(guard, path, ("Cookie", f"egvs_explore_4321={guard.key}")) == 403
+    assert status(guard, f"{path}&key={guard.key}") == 403
+
+
+def parse_request(content: bytes) -> Request:
+    """Parse the bytes of a request as the server does."""
+    stream = StreamReader()
+    stream.feed_data(content)
+    with pytest.raises(StopIteration) as end:
+        next(Request.parse(stream.read_line))
+    request: Request = end.value.value
+    return request
+
+
+@pytest.mark.parametrize("value", [b"\xff", "ä".encode(), "柱".encode()])
+def test_cookie_that_is_not_ascii_is_refused(guard: AccessGuard, value: bytes) -> None:
+    lines = [b"GET / HTTP/1.1", b"Host: " + HOST.encode(), b"Cookie: egvs_explore_4321=" + value, b"", b""]
+    response = guard.check_request(PORT, parse_request(b"\r\n".join(lines)))
+    assert response is not None
+    assert response.status_code == 403
 
 
 def test_request_with_two_hosts_is_refused(guard: AccessGuard) -> None:

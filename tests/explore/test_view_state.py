@@ -44,7 +44,7 @@ pitch = st.floats(-90, 90)
 
 @given(
     pose=st.builds(Pose, finite, finite, finite, finite, pitch, finite),
-    gamma=st.none() | st.floats(0, 1e9) | st.just(float("inf")),
+    gamma=st.none() | st.floats(1e-9, 1e9) | st.sampled_from((0.0, float("inf"))),
     layer=st.sampled_from(sorted(LAYERS)),
     ring=st.integers(0, 200),
     frame=st.integers(0, 10**6),

@@ -270,6 +270,40 @@ def test_las_returns_scaled_coordinates_in_float64(tmp_path: Path, name: str) ->
     assert dropped == 0
 
 
+@needs_laspy
+@pytest.mark.parametrize("declared", [1, 150, 299])
+def test_rejects_las_with_more_points_than_it_declares(tmp_path: Path, declared: int) -> None:
+    path, _ = las(tmp_path, "a.las")
+    content = bytearray(path.read_bytes())
+    content[247:255] = struct.pack("<Q", declared)
+    path.write_bytes(content)
+    message = f"the header declares {declared} points, but there are {30 * (300 - declared)} bytes after the last one"
+    with pytest.raises(InputError, match=message):
+        read_points(path, "")
+
+
+@needs_laspy
+def test_rejects_laz_with_more_chunks_than_its_points_need(tmp_path: Path) -> None:
+    path, _ = las(tmp_path, "a.laz", 120_000)  # chunks of 50,000 points
+    content = bytearray(path.read_bytes())
+    content[247:255] = struct.pack("<Q", 60_000)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="the header declares 60000 points, but there are 3 chunks of 50000 points"):
+        read_points(path, "")
+
+
+@needs_laspy
+def test_records_after_the_points_of_las_are_no_points(tmp_path: Path) -> None:
+    import laspy
+
+    path, expected = las(tmp_path, "a.las")
+    with laspy.open(path) as file:
+        cloud = file.read()
+    cloud.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("someone", 7, "text", b"x" * 5000)])
+    cloud.write(path)
+    assert read_points(path, "")[0].tobytes() == expected.tobytes()
+
+
 @pytest.mark.slow
 @pytest.mark.system
 @needs_laspy

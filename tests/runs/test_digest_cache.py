@@ -15,7 +15,7 @@ import egvs
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import digests, files
 from egvs.core.digests import hash_input
-from egvs.runs.digest_cache import forget_digests, remember_digests
+from egvs.runs.digest_cache import remember_digests
 from tests.conftest import write_mini
 
 OLD_S = 1_000_000_000
@@ -137,11 +137,12 @@ def test_cache_is_not_written_after_error(all_local: None, tmp_path: Path) -> No
     assert not (tmp_path / ".digests.json").exists()
 
 
-def test_forgotten_digests_are_computed_again(all_local: None, hashed: HashedFiles, tmp_path: Path) -> None:
+def test_digests_that_are_not_trusted_are_computed_again(all_local: None, hashed: HashedFiles, tmp_path: Path) -> None:
     write_old(tmp_path / "a", b"one")
     hashed.digest(tmp_path / "a")
-    forget_digests(tmp_path)
-    hashed.digest(tmp_path / "a")
+    hashed.paths.clear()
+    with remember_digests(RunFolder(tmp_path), trusted=False):
+        hash_input(tmp_path / "a")
     assert hashed.paths
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 import egvs
 from egvs.artefacts import parquet
+from egvs.core.errors import InputError
 from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.score_config import default_gamma
 from egvs.studies import study_settings
@@ -51,6 +53,24 @@ def test_gamma_of_scenario(auto: Path) -> None:
     assert egvs.load(auto).score.gamma == "auto"
     assert (of(), of("roi.voxel_m=1"), of(OCCLUSION), of("score.gamma=7", OCCLUSION)) == (4.5, 10.0, 2.2, 7.0)
     assert of("score.gamma=inf") == float("inf")
+
+
+@pytest.mark.parametrize("gamma", ["1e-300", "1e-10", "5e-324"])
+def test_rejects_gamma_whose_squares_are_no_numbers(auto: Path, gamma: str) -> None:
+    with pytest.raises(InputError, match=r"score\.gamma: expected 0, or at least 1e-09, got"):
+        egvs.load(auto, [f"score.gamma={gamma}"])
+
+
+@pytest.mark.parametrize("gamma", [1e-9, 1e12, 1e300])
+def test_errors_of_smallest_and_largest_gamma_are_in_proportion(auto: Path, tmp_path: Path, gamma: float) -> None:
+    """The smallest caps every voxel; the largest caps none."""
+    relative = []
+    for number, value in enumerate((gamma, 1e-3 if gamma < 1 else math.inf)):
+        egvs.run(egvs.load(auto, [f"score.gamma={value}"]), tmp_path / str(number))
+        table = egvs.read_scores(tmp_path / str(number) / "scores.parquet")
+        relative.append(table["egvs_se"].to_numpy() / table["egvs"].to_numpy())
+    assert relative[0] == pytest.approx(relative[1], rel=1e-9)
+    assert min(relative[0]) > 0.01
 
 
 def test_with_effects_keeps_gamma(auto: Path) -> None:

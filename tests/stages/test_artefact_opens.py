@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import pyarrow.parquet as pq
 import pytest
@@ -22,8 +22,8 @@ def count_opens(scenario: egvs.Scenario, out: Path, monkeypatch: pytest.MonkeyPa
     running = [""]
 
     class CountingFile(pq.ParquetFile):  # type: ignore[misc]
-        def __init__(self, source: Path, **options: Any) -> None:
-            counts[running[-1], Path(source).name] += 1
+        def __init__(self, source: BinaryIO, **options: Any) -> None:
+            counts[running[-1], Path(source.name).name] += 1
             super().__init__(source, **options)
 
     monkeypatch.setattr(parquet.pq, "ParquetFile", CountingFile)

@@ -417,6 +417,26 @@ def test_warns_of_repeated_beams(street: Path) -> None:
     }
 
 
+@pytest.mark.parametrize(
+    ("rings", "message"),
+    [
+        ("elevations_deg=[-15,-15,-15,-5]", "8 of 16 beams have the same direction"),
+        ("elevations_deg=[-15,-15],channels=3", "8 of 12 beams have the same direction"),
+        ("elevations_deg=[-15,-5,-15],azimuth_offsets_deg=[0,0,90]", "4 of 12 beams have the same direction"),
+    ],
+)
+def test_warns_of_repeated_rings(street: Path, rings: str, message: str) -> None:
+    settings = (f"sensors.own={{{rings},azimuth_step_deg=90,range_m=90}}", 'sites.sensor="own"', 'sites.aim="roi"')
+    (told,) = found(street, *settings)["repeated beams"]
+    assert told.startswith("[scenario.toml: sensors.own.elevations_deg: ")
+    assert message in told
+
+
+def test_rings_at_one_elevation_with_other_azimuths_are_no_repetition(street: Path) -> None:
+    rings = "elevations_deg=[-15,-15],azimuth_offsets_deg=[0,45],azimuth_step_deg=90,range_m=90"
+    assert found(street, f"sensors.own={{{rings}}}", 'sites.sensor="own"', 'sites.aim="roi"') == {}
+
+
 # ---- files, and the keys of the stage
 
 

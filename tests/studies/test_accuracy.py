@@ -290,7 +290,7 @@ BAD = {
     ("--seeds", "4"): "--seeds: the traffic is a finished file",
     ("--budget", "soon"): "--budget: expected a time above 0, got 'soon'",
     ("--budget", "-3s"): "--budget: expected a time above 0, got '-3s'",
-    ("--budget", ""): "--budget: expected a time above 0, got ''",
+    ("--budget", ""): "--budget: expected a value, got an empty text",
     ("--set", "roi.voxel_m=0.3"): "voxel",
 }
 

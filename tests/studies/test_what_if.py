@@ -11,6 +11,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from egvs.artefacts.run_folder import RunFolder
@@ -85,7 +86,28 @@ def test_expected_score_is_the_mean_over_the_time(answered: WhatIfResult) -> Non
     before = sites["pole_a"].before
     assert lorry == pytest.approx(0.75 * before)
     assert far == before
-    assert together == pytest.approx(lorry + south - before)
+    assert together == pytest.approx(lorry * south / before)
+
+
+def test_solids_that_hide_the_same_vehicles_leave_no_negative_score() -> None:
+    """The first site loses nearly all to either table; the second has nothing to lose; the third gains."""
+    before = np.array([993.0, 0.0, 10.0])
+    present = [np.array([156.0, 0.0, 20.0]), np.array([224.0, 5.0, 10.0])]
+    together = what_if.expected_values(before, present, [0.3, 1.0])
+    one_by_one = [what_if.expected_values(before, [p], [share]) for p, share in zip(present, (0.3, 1.0), strict=True)]
+    assert 0.0 < together[0] <= min(values[0] for values in one_by_one)
+    assert together.tolist() == pytest.approx([(993 - 0.3 * 837) / 993 * 224, 5.0, 13.0])
+
+
+def test_all_together_is_between_0_and_the_worst_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    same = LORRY.replace("what_if.lorry", "what_if.same").replace("0.25", "1")
+    scenario(tmp_path, LORRY.replace("0.25", "0.9") + same)
+    result = compare_runs(prepare_runs(Path("mini")), run_one)
+    for site in result.sites:
+        *single, together = site.expected
+        assert together is not None
+        assert 0.0 <= together <= min(value for value in single if value is not None)
 
 
 def test_best_site_changes_where_its_view_is_hidden(answered: WhatIfResult) -> None:
@@ -146,7 +168,8 @@ def test_command_prints_the_answer_and_repeats_it_from_the_folders(
     assert "lorry (100 % of the time): pole_b" in printed
     again = run_egvs("what-if", "mini", "--only", "lorry")
     assert again[1] == printed
-    assert [line.split()[-2] for line in again[2].splitlines()[-2:]] == ["unchanged"] * 2
+    stages = [line for line in again[2].splitlines() if not line.startswith("warning: ")]
+    assert [line.split()[-2] for line in stages[-2:]] == ["unchanged"] * 2
 
 
 def test_solid_over_a_site_gets_the_message_of_the_check(tmp_path: Path, monkeypatch: Any, run_egvs: Any) -> None:

@@ -95,6 +95,12 @@ def test_columns_in_any_order_with_others_between(tmp_path):
     assert np.isnan(row["speed"])
 
 
+def test_time_of_a_step_counts_in_xml(tmp_path):
+    path = tmp_path / "fcd.xml"
+    path.write_text(XML.replace("<vehicle ", '<vehicle time="77" '))
+    assert read_all(path).to_pydict() == ROWS
+
+
 def test_persons_in_csv_are_skipped(tmp_path):
     path = tmp_path / "fcd.csv"
     path.write_text(f"{HEADER};person_id;person_x\n1;;;;;;;p;3\n1;v;1;2;3;car;4;;\n")
@@ -121,6 +127,15 @@ BAD = {
         r"row 1: x of vehicle 'v' is 1000000000.0. Use a finite number, at most",
     ),
     "infinite x": (f"{HEADER}\n{row(x='inf')}\n".encode(), r"row 1: x of vehicle 'v' is inf"),
+    "x and vehicle_x": (
+        f"{HEADER};x\n{row()};1\n".encode(),
+        r"the columns 'vehicle_x' and 'x' both stand for 'x'. Remove one of them",
+    ),
+    "vehicle_x twice": (
+        f"{HEADER};vehicle_x\n{row()};1\n".encode(),
+        r"the columns 'vehicle_x' and 'vehicle_x' both stand for 'x'",
+    ),
+    "time and timestep_time": (f"{HEADER};time\n{row()};1\n".encode(), r"both stand for 'time'"),
     "no type given": (f"{HEADER}\n{row(type='')}\n".encode(), r"row 1: vehicle 'v' has no type"),
     "time runs back": (f"{HEADER}\n{row(time='2')}\n{row()}\n".encode(), r"row 2: time 1 s comes after 2 s"),
     "time too fine": (f"{HEADER}\n{row(time='0.0005')}\n".encode(), r"row 1: .*milliseconds, got time 0\.000500 s"),

@@ -46,6 +46,22 @@ def test_rejects_invalid_binary(tmp_path, monkeypatch):
         sumo.run_program("sumo", [], tmp_path)
 
 
+@pytest.mark.parametrize(("variable", "name"), [("SUMO_BINARY", "sumo"), ("NETCONVERT_BINARY", "netconvert")])
+def test_rejects_missing_program_of_the_environment(tmp_path, monkeypatch, variable, name):
+    for missing in (tmp_path / "absent", tmp_path, "no-such-program"):
+        monkeypatch.setenv(variable, str(missing))
+        with pytest.raises(InputError, match=f"{variable}: expected a program, got '{missing}'"):
+            sumo.sumo_binary(name)
+    monkeypatch.setenv(variable, "")
+    assert sumo.sumo_binary(name).is_file()
+
+
+def test_rejects_missing_folder_of_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("SUMO_HOME", str(tmp_path / "absent"))
+    with pytest.raises(InputError, match="SUMO_HOME: expected a folder, got"):
+        sumo.sumo_binary("sumo")
+
+
 def test_finding_sumo_preserves_proj_variables(monkeypatch):
     """The wheel's data is of a PROJ that rasterio's refuses."""
     for name in ("PROJ_DATA", "PROJ_LIB", "SUMO_HOME"):

@@ -25,6 +25,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from egvs.core import files, limits, reading
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
 from egvs.core.package_data import SCHEMAS, data_folder
@@ -190,7 +191,7 @@ def open_artefact(path: Path, artefact: str) -> Iterator[OpenArtefact]:
 def _open_checked(path: Path, artefact: str, stack: ExitStack) -> OpenArtefact:
     """Open a file until ``stack`` ends, and check its columns and metadata."""
     with _translate_parquet_errors(path):
-        file = stack.enter_context(pq.ParquetFile(path))
+        file = stack.enter_context(pq.ParquetFile(stack.enter_context(open_input(path))))
     _check_columns(path, artefact, file.schema_arrow)
     content = (file.metadata.metadata or {}).get(_METADATA_KEY)
     if content is None:

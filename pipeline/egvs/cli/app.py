@@ -7,6 +7,7 @@ the verb that needs them, so that ``egvs --help`` is quick.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,7 +16,7 @@ import typer
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import compare, exit, place, sources, what_if
+from egvs.cli import compare, environment, exit, place, sources, what_if
 from egvs.cli import options as cli_options
 from egvs.cli.commands import PANELS, ExtensibleGroup
 from egvs.cli.options import (
@@ -52,6 +53,7 @@ app = typer.Typer(
 def main() -> None:
     """Run the command line; errors of this program become one message and an exit code."""
     with exit.report_errors(), exit.after_imports():
+        environment.check_environment(sys.argv[1:])
         app()
 
 
@@ -102,14 +104,12 @@ def run(
     stage_options = {"score": {"audit": True}} if audit else None
     with ProgressDisplay("run", with_details=verbose) as screen:
         from egvs.cli import answer, run_tables
-        from egvs.runs import digest_cache
-        from egvs.runs.run import run
+        from egvs.runs.run import run, run_rehashed
 
         loaded, folder = _load(scenario, cli_options.with_detector(set_, detector), out)
         screen.flow_source = answer.flow_source(loaded)
-        if rehash:
-            digest_cache.forget_digests(folder)
-        record = run(
+        run_all = run_rehashed if rehash else run
+        record = run_all(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
     if not screen.any_stage_ran:

@@ -235,7 +235,9 @@ class ProgressDisplay:
         if state in ("runs", "fetched"):
             self.any_stage_ran = True
         self._show_stage(stage)
-        if record is None:
+        if state == "corrected":
+            self.say(f"{stage}: the artefacts in the folder did not belong to those that they are made of; made again")
+        if record is None or state == "corrected":
             return
 
         if state == "done":

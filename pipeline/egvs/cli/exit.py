@@ -37,6 +37,12 @@ _USER_ERRORS = (FileNotFoundError, IsADirectoryError, NotADirectoryError, Permis
 _BAD_NAME_ERRNOS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
 """Errors about names that cannot be names of files."""
 
+SURROGATES = "surrogates not allowed"
+"""Reason of the error of a text that is not Unicode, because it is the name of a file that is not UTF-8."""
+
+_NO_MEMORY_TEXTS = ("failed to map segment", "cannot allocate memory", "cannot create shared object descriptor")
+"""What the loader of the system says where memory for a library is missing."""
+
 _MEMORY_HINT = "Use larger voxels, a smaller region, fewer beams or fewer --jobs."
 
 
@@ -56,6 +62,14 @@ def report_errors() -> Iterator[None]:
         sys.exit(_FAILED)
     except OSError as error:
         _fail(*describe_os_error(error))
+    except UnicodeEncodeError as error:
+        if error.reason != SURROGATES:
+            raise
+        _fail(f"{error.object}: the name of the file is not UTF-8. Rename it.", InputError.exit_code)
+    except ImportError as error:
+        if not any(text in str(error) for text in _NO_MEMORY_TEXTS):
+            raise
+        _fail(f"not enough memory ({error}). {_MEMORY_HINT}", _FAILED)
     except MemoryError as error:
         _fail(f"not enough memory ({error or 'none is left'}). {_MEMORY_HINT}", _FAILED)
     except SystemExit as end:  # raised by typer, also after an interrupt

@@ -50,7 +50,8 @@ Verbose = Annotated[
     bool, typer.Option("--verbose", help="Print all details of each stage, all warnings, the files and their cost.")
 ]
 Rehash = Annotated[
-    bool, typer.Option("--rehash", help="Hash every file again, also those that seem unchanged since the last run.")
+    bool,
+    typer.Option("--rehash", help="Hash every file again, and make scans, TPOG and scores again to compare them."),
 ]
 DEFAULT_POLES = 5
 """Poles that ``egvs run`` and ``egvs demo`` print unless options ask for others."""

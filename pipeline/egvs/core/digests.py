@@ -1,8 +1,9 @@
 """Digests of files, and the contents of input files: what is hashed is what is parsed.
 
 A run has one :class:`Digests`, which hashes each file once and reads each input file once. If the user edits a file
-meanwhile, the run goes on with what it has read, or ends with an error. Files that the run writes itself, in its folder
-or in temporary folders, are read each time.
+meanwhile, the run goes on with what it has read, or ends with an error. Artefacts, and files too large to be held in
+memory, are compared with their digest when they are opened (:meth:`Digests.open`), and with their time stamps after the
+work that depends on them (:meth:`Digests.check_unchanged`). So a file that is replaced meanwhile changes no result.
 
 Files that did not change since an earlier run are not read again. Like git, this compares the size, the times of the
 last change (mtime and ctime), the inode and the device of a file with those from when it was hashed. A file is hashed
@@ -22,7 +23,7 @@ import os
 import stat
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
@@ -81,6 +82,7 @@ class Digests:
         self._digests: dict[str, str] = {}
         self._contents: dict[str, bytes] = {}
         self._held_bytes = 0
+        self._collected: dict[str, Path] = {}
         self.entries: Entries = {}
 
     def of(self, path: Path) -> str:
@@ -94,6 +96,7 @@ class Digests:
         name = os.path.realpath(path)
         if not self._is_in_folder(name) and files.is_temporary(Path(name)):
             return files.hash_file(path)
+        self._collected[name] = path
         if name not in self._digests:
             digest = self._earlier_digest(name)
             if digest is None:
@@ -115,24 +118,94 @@ class Digests:
         name = os.path.realpath(path)
         if name not in self._contents:
             if not self._can_hold(path, name):
-                return path.open("rb")
+                return self._open_unheld(path, name)
             stamp, hashed_ns = _file_stamp(name), time.time_ns()
             content = path.read_bytes()
             digest = hashlib.sha256(content).hexdigest()
             if self._digests.setdefault(name, digest) != digest:
-                raise InputError(path, "was changed while it was in use", "Repeat the command.")
+                raise _changed_error(path)
             self._add_entry(name, stamp, hashed_ns, digest)
             self._contents[name] = content
             self._held_bytes += len(content)
         return io.BytesIO(self._contents[name])
 
+    def _open_unheld(self, path: Path, name: str) -> io.BufferedReader:
+        """Open a file that is not held, and compare what was opened with its digest.
+
+        Nothing is compared for a file that the run writes itself, until its digest is known.
+        """
+        file = path.open("rb")
+        try:
+            status = os.fstat(file.fileno())
+            is_own = self._is_in_folder(name) or files.is_temporary(Path(name))
+            is_known = name in self._digests or name in self._recorded
+            if not stat.S_ISREG(status.st_mode) or (is_own and not is_known):
+                return file
+            expected = self.of(path)
+            stamp, hashed_ns = _stamp(status), time.time_ns()
+            if not self._is_trusted(name, stamp, expected):
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+                file.seek(0)
+                if digest != expected:
+                    raise _changed_error(path)
+                self._add_entry(name, stamp, hashed_ns, digest)
+        except BaseException:
+            file.close()
+            raise
+        return file
+
+    def check_unchanged(self, paths: Mapping[str, Path] | None = None) -> None:
+        """Check that files are still those that were hashed, after the work that has read them.
+
+        Contents that are held in memory cannot change, so their files may.
+
+        Parameters
+        ----------
+        paths
+            Files by real path (:meth:`collect`); all files that were hashed if None.
+
+        Raises
+        ------
+        InputError
+            When a file was changed or replaced, even if it was replaced by the original in the end.
+        """
+        for name, path in list((self._collected if paths is None else paths).items()):
+            if name in self._digests and name not in self._contents and not self._is_unchanged(name):
+                raise _changed_error(path)
+
+    @contextmanager
+    def unchanged(self, *paths: Path) -> Iterator[None]:
+        """Check files that the block reads by their names, perhaps in another process, as :meth:`check_unchanged`."""
+        names = {os.path.realpath(path): path for path in paths if path.is_file()}
+        hashed = {name: path for name, path in names.items() if name in self._digests}
+        yield
+        for name, path in hashed.items():
+            if name in self._digests and not self._is_unchanged(name):
+                raise _changed_error(path)
+
+    @contextmanager
+    def collect(self) -> Iterator[dict[str, Path]]:
+        """Yield the files whose digests are requested in the block, by real path."""
+        outer, self._collected = self._collected, {}
+        try:
+            yield self._collected
+        finally:
+            self._collected = outer | self._collected
+
+    def expect(self, digests: Mapping[Path, str]) -> None:
+        """Note the digests of files that were just written: other content under these names is refused."""
+        for path, digest in digests.items():
+            name = os.path.realpath(path)
+            self._digests[name] = digest
+            self.entries.pop(name, None)
+
     def forget(self, *paths: Path) -> None:
         """Forget files, or all files in folders, that are about to be written."""
         for written in map(os.path.realpath, paths):
-            for digests in (self._digests, self._recorded):
-                for file in list(digests):
+            for known in (self._digests, self._recorded, self.entries):
+                for file in list(known):
                     if Path(file).is_relative_to(written):
-                        del digests[file]
+                        del known[file]
 
     def _is_in_folder(self, name: str) -> bool:
         return self._folder is not None and Path(name).is_relative_to(self._folder)
@@ -146,14 +219,28 @@ class Digests:
 
     def _earlier_digest(self, name: str) -> str | None:
         """Return the digest of an earlier run; None if the file may have changed since."""
-        if name not in self._earlier or not Path(name).is_file():
+        entry = self._earlier.get(name)
+        if entry is None or not Path(name).is_file() or not _is_current(entry, _file_stamp(name)):
             return None
-        *recorded, hashed_ns, digest = self._earlier[name]
-        stamp = _file_stamp(name)
-        if stamp is None or recorded != list(stamp) or stamp[1] + RACY_NS > hashed_ns:
-            return None
-        self.entries[name] = self._earlier[name]
-        return str(digest)
+        self.entries[name] = entry
+        return str(entry[-1])
+
+    def _is_trusted(self, name: str, stamp: Stamp | None, digest: str) -> bool:
+        """Whether the stamp alone shows that a file has a digest."""
+        entry = self.entries.get(name)
+        return entry is not None and entry[-1] == digest and _is_current(entry, stamp)
+
+    def _is_unchanged(self, name: str) -> bool:
+        """Whether a file is the one that was hashed, and has been all the time.
+
+        A new link to a file changes nothing but its ctime; then, and where the stamp is too young, the file is hashed.
+        """
+        digest, entry, stamp = self._digests[name], self.entries.get(name), _file_stamp(name)
+        if self._is_trusted(name, stamp, digest):
+            return True
+        if entry is not None and stamp is not None and not _is_same_file(entry, stamp):
+            return False
+        return Path(name).is_file() and files.hash_file(Path(name)) == digest
 
     def _add_entry(self, name: str, stamp: Stamp | None, hashed_ns: int, digest: str) -> None:
         """Note the digest of a file for a later run, unless the file changed while it was read."""
@@ -196,12 +283,40 @@ def hash_input(path: Path) -> str:
     return files.hash_file(path) if digests is None else digests.of(path)
 
 
+@contextmanager
+def unchanged_inputs(*paths: Path) -> Iterator[None]:
+    """Check, in a run, files that the block reads by their names, as :meth:`Digests.unchanged`."""
+    digests = _IN_USE.get()
+    with nullcontext() if digests is None else digests.unchanged(*paths):
+        yield
+
+
+def _changed_error(path: Path) -> InputError:
+    return InputError(path, "was changed while it was in use", "Repeat the command.")
+
+
+def _is_current(entry: list[Any], stamp: Stamp | None) -> bool:
+    """Whether a file with a stamp still has the digest of an entry, as far as stamps can be trusted."""
+    *recorded, hashed_ns, _ = entry
+    return stamp is not None and recorded == list(stamp) and stamp[1] + RACY_NS <= hashed_ns
+
+
+def _is_same_file(entry: list[Any], stamp: Stamp) -> bool:
+    """Whether size, mtime, inode and device are those of an entry."""
+    size, mtime_ns, _, inode, device, *_ = entry
+    return (size, mtime_ns, inode, device) == (stamp[0], stamp[1], *stamp[3:])
+
+
 def _file_stamp(name: str) -> Stamp | None:
     """Return what changes when a file is written; None where it cannot be trusted."""
     try:
-        status = Path(name).stat()
+        return _stamp(Path(name).stat())
     except OSError:
         return None
+
+
+def _stamp(status: os.stat_result) -> Stamp | None:
+    """Return the stamp of a file; None where it cannot be trusted."""
     if not stat.S_ISREG(status.st_mode) or status.st_dev not in _local_devices():
         return None
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino, status.st_dev

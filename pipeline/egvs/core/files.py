@@ -18,9 +18,10 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from egvs.core import platform
 from egvs.core.errors import InputError
@@ -29,6 +30,9 @@ DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk or an exhausted quota."""
 
 _TEMP_PREFIX, _MAX_ATTEMPTS = "egvs-work-", 10
+
+_MIN_FREE_BYTES, _MIN_FREE_BYTES_AFTER_ERROR = 4096, 1_000_000
+"""What a disk must still take that is not full; after an error, a library may have removed part of what it wrote."""
 
 
 @contextmanager
@@ -45,6 +49,50 @@ def attach_filename(path: Path) -> Iterator[None]:
         raise
 
 
+def check_utf8(where: str, name: str) -> None:
+    """Check that the name of a file is UTF-8: records and artefacts contain names.
+
+    Raises
+    ------
+    InputError
+        At ``where``, when it is not.
+    """
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        raise InputError(where, f"expected a name in UTF-8, got {name!r}", "Rename the file or the folder.") from None
+
+
+@contextmanager
+def check_disk_space(folder: Path, *errors: type[Exception]) -> Iterator[None]:
+    """Raise the error of a full disk where another library, which writes to a folder, raises its own, or none at all.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    *errors
+        What the library raises.
+
+    Raises
+    ------
+    OSError
+        When the folder cannot take more.
+    """
+    try:
+        yield
+    except errors:
+        _write_probe(folder, _MIN_FREE_BYTES_AFTER_ERROR)
+        raise
+    _write_probe(folder, _MIN_FREE_BYTES)
+
+
+def _write_probe(folder: Path, n_bytes: int) -> None:
+    with attach_filename(folder), tempfile.TemporaryFile(dir=folder) as file:
+        file.write(b"0" * n_bytes)
+        file.flush()
+
+
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a path to write to; rename it to ``path`` when the block ends well, remove it when it does not."""
@@ -55,10 +103,38 @@ def atomic_write(path: Path) -> Iterator[Path]:
     try:
         with attach_filename(path):
             yield partial
+        written = _WRITTEN.get()
+        if written is not None and path.is_relative_to(written.folder):
+            written.digests[path.relative_to(written.folder).as_posix()] = hash_file(partial)
         partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+class _WrittenFiles(NamedTuple):
+    """Digests of the files that were written in a folder, by path in the folder."""
+
+    folder: Path
+    digests: dict[str, str]
+
+
+_WRITTEN: ContextVar[_WrittenFiles | None] = ContextVar("_WRITTEN", default=None)
+
+
+@contextmanager
+def hash_written_files(folder: Path) -> Iterator[dict[str, str]]:
+    """Yield the SHA-256 of each file, by path in a folder, that the block writes there with :func:`atomic_write`.
+
+    A file is hashed before it gets its name, so that the digest is that of what was written, even if another program
+    replaces the file at once.
+    """
+    written = _WrittenFiles(folder, {})
+    token = _WRITTEN.set(written)
+    try:
+        yield written.digests
+    finally:
+        _WRITTEN.reset(token)
 
 
 @contextmanager

@@ -80,6 +80,14 @@ def peak_memory_mb() -> float:
     return float(getattr(memory, "peak_wset", memory.rss)) / (1024 * 1024)
 
 
+def address_space_limit_mb() -> float | None:
+    """Return the limit of this process's address space, in MB; None where there is none."""
+    if not HAS_POSIX:
+        return None
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit / 1e6
+
+
 def raise_open_file_limit(count: int) -> None:
     """Let this process open so many files, as far as the system allows; Windows allows thousands anyway."""
     if not HAS_POSIX:

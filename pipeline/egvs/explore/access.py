@@ -99,9 +99,13 @@ class AccessGuard:
         if is_page:
             origins.append([])  # browsers send no origin when somebody opens an address
         has_host = headers.get_all("Host") in [[host] for host in hosts]
-        if not has_host or headers.get_all("Origin") not in origins or len(request.path) > _MAX_PATH_LENGTH:
+        is_address = request.path.isascii() and len(request.path) <= _MAX_PATH_LENGTH
+        if not has_host or headers.get_all("Origin") not in origins or not is_address:
             return _response(http.HTTPStatus.FORBIDDEN)
-        query = dict(parse_qsl(urlsplit(request.path).query))
+        try:
+            query = dict(parse_qsl(urlsplit(request.path).query))
+        except ValueError:  # no address that a browser sends
+            return _response(http.HTTPStatus.FORBIDDEN)
         if is_page and self._is_key(query.pop(KEY_PARAMETER, "")):
             target = urlencode(self._on_open(query), safe=",")
             location = f"/?{target}" if target else "/"
@@ -112,7 +116,8 @@ class AccessGuard:
         return _response(http.HTTPStatus.FORBIDDEN)
 
     def _is_key(self, value: str) -> bool:
-        return secrets.compare_digest(value.encode(), self.key.encode())
+        # bytes of a header that are not ASCII become surrogates
+        return secrets.compare_digest(value.encode("utf-8", "surrogateescape"), self.key.encode())
 
 
 def _cookie_name(port: int) -> str:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from egvs.artefacts import readers
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import read_tpog
+from egvs.core import files
 from egvs.core.grid import Grid
 from egvs.drawing import colours
 from egvs.drawing.run_figures import column_entropy
@@ -228,16 +229,21 @@ def _write_tiff(
     description: str,
     colour_table: Mapping[int, tuple[int, int, int, int]] | None = None,
 ) -> Path:
-    import rasterio
+    import rasterio.errors
+    from rasterio._err import CPLE_BaseError
     from rasterio.crs import CRS
     from rasterio.transform import Affine
 
     rows, columns = values.shape
     transform = Affine(geo_raster.width, 0.0, geo_raster.west, 0.0, -geo_raster.height, geo_raster.north)
-    with rasterio.open(
-        path, "w", driver="GTiff", width=columns, height=rows, count=1, dtype=values.dtype.name, nodata=nodata,
-        crs=CRS.from_user_input(reference.crs), transform=transform, **_TILE,
-    ) as file:  # fmt: skip
+    crs = CRS.from_user_input(reference.crs)
+    with (
+        files.check_disk_space(path.parent, rasterio.errors.RasterioError, CPLE_BaseError),
+        rasterio.open(
+            path, "w", driver="GTiff", width=columns, height=rows, count=1, dtype=values.dtype.name, nodata=nodata,
+            crs=crs, transform=transform, **_TILE,
+        ) as file,
+    ):  # fmt: skip
         file.update_tags(TIFFTAG_IMAGEDESCRIPTION=description, AREA_OR_POINT="Area")
         if colour_table is not None:  # before the values, or it is not in the header
             file.write_colormap(1, dict(colour_table))

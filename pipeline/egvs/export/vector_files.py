@@ -65,7 +65,8 @@ def write_geopackage(path: Path, layers: Sequence[Layer], reference: ExportCrs) 
     import pyogrio
     import shapely
 
-    with _fixed_time():
+    full_disk_errors = (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, pyogrio.errors.FeatureError)
+    with _fixed_time(), files.check_disk_space(path.parent, *full_disk_errors):
         dataset_options: dict[str, str] | None = {"VERSION": _VERSION}
         for number, layer in enumerate(layers):
             shapes = shapely.to_wkb(reference.geometries(layer.geometries))
@@ -77,7 +78,7 @@ def write_geopackage(path: Path, layers: Sequence[Layer], reference: ExportCrs) 
                 layer_options={"FID": _NUMBER, "GEOMETRY_NAME": _GEOMETRY, "IDENTIFIER": layer.name},
             )  # fmt: skip
             dataset_options = None  # the file exists
-    with closing(sqlite3.connect(path)) as database, database:
+    with files.check_disk_space(path.parent, sqlite3.Error), closing(sqlite3.connect(path)) as database, database:
         database.executescript(_STYLES)
         rows = [(layer.name, _GEOMETRY, layer.name, layer_qml(layer), _EPOCH) for layer in layers]
         database.executemany(

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.csv
 
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.formats.point_clouds import NUMBER_HINT, parse_float, stack_xyz
@@ -24,7 +25,8 @@ _HINT = "Write a header row with x_m, y_m, z_m, then one return per row."
 
 def read(path: Path, where: str) -> FloatArray:
     """Return all points, (n, 3) float64; InputError at ``where`` for a damaged file."""
-    data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    with open_input(path) as file:
+        data = file.read().removeprefix(b"\xef\xbb\xbf")
     head, _, body = data.partition(b"\n")
     names = _column_names(where, head)
     if not body.strip():

@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -22,7 +22,12 @@ from egvs.core.reading import COMPLETE_FILE, translate_errors
 from egvs.formats.point_clouds import PointChunk, stack_xyz
 from egvs.formats.reader_process import Block, read_blocks, serve
 
+if TYPE_CHECKING:
+    import laspy
+
 _CHUNK = 1_000_000
+_CHUNK_SIZE_AT = 12
+"""Position of the size of chunks in the record of LASzip."""
 _CANNOT_READ = "cannot be read as LAS"
 _INSTALL_HINT = "Run pip install 'egvs[las]'."
 
@@ -60,16 +65,37 @@ def _check_file(path: Path, where: str) -> int:
         if is_packed:
             if laspy.LazBackend.Lazrs not in laspy.LazBackend.detect_available():
                 raise InputError(where, "needs lazrs, which is not installed", _INSTALL_HINT)
-            _check_chunks(where, file, size)
+            chunks = _check_chunks(where, file, size)
         file.seek(0)
         with laspy.open(file, closefd=False, read_evlrs=False) as las:
             declared = int(las.header.point_count)
             expected = declared * las.header.point_format.size
             actual = size - las.header.offset_to_point_data
-    if actual < expected and not is_packed:
+            after_points = _first_record_after_points(las.header)
+            chunk_size = _chunk_size(las.header) if is_packed else None
+    if is_packed:
+        if chunks and chunk_size and chunks > -(-declared // chunk_size):
+            problem = f"the header declares {declared} points, but there are {chunks} chunks of {chunk_size} points"
+            raise InputError(where, problem, COMPLETE_FILE)
+        return declared
+    if actual < expected:
         problem = f"the header declares {expected} bytes of points, but the file contains {actual}"
         raise InputError(where, problem, COMPLETE_FILE)
+    most = min(actual, (after_points or size) - (size - actual))
+    if most - expected >= expected // max(1, declared) > 0:
+        problem = f"the header declares {declared} points, but there are {most - expected} bytes after the last one"
+        raise InputError(where, problem, COMPLETE_FILE)
     return declared
+
+
+def _first_record_after_points(header: laspy.LasHeader) -> int:
+    """Return where the first record after the points starts; 0 if there is none."""
+    starts = []
+    if header.number_of_evlrs:
+        starts.append(int(header.start_of_first_evlr))
+    if header.global_encoding.waveform_data_packets_internal:
+        starts.append(int(header.start_of_waveform_data_packet_record))
+    return min(starts, default=0)
 
 
 def _checked_chunks(path: Path, where: str, declared: int) -> Iterator[FloatArray]:
@@ -144,17 +170,31 @@ def _is_packed(path: Path) -> bool:
         return _has_laz_bits(file.read(105))
 
 
-def _check_chunks(where: str, file: BinaryIO, size: int) -> None:
-    """Check the number of chunks that a LAZ file declares: lazrs ends the process when there is no memory for them."""
+def _chunk_size(header: laspy.LasHeader) -> int | None:
+    """Return the number of points in each chunk of a LAZ file but the last; None where chunks differ, or for no LAZ."""
+    records = header.vlrs.get("LasZipVlr")
+    content = records[0].record_data if records else b""
+    if len(content) < _CHUNK_SIZE_AT + 4:
+        return None
+    size = int.from_bytes(content[_CHUNK_SIZE_AT : _CHUNK_SIZE_AT + 4], "little")
+    return None if size in (0, 0xFFFFFFFF) else size
+
+
+def _check_chunks(where: str, file: BinaryIO, size: int) -> int:
+    """Return the number of chunks that a LAZ file declares, 0 where it does not.
+
+    InputError where there cannot be so many: lazrs ends the process when there is no memory for them.
+    """
     points_at = _number_at(file, "<I", 96)
     table_at = _number_at(file, "<q", points_at)
     if table_at == -1:  # written as a stream: the offset is at the end
         table_at = _number_at(file, "<q", size - 8)
     if not 0 < table_at <= size - 8:
-        return
+        return 0
     chunks = _number_at(file, "<I", table_at + 4)
     if chunks > size:
         raise InputError(where, f"the file declares {chunks} chunks in {size} bytes", COMPLETE_FILE)
+    return chunks
 
 
 def _number_at(file: BinaryIO, kind: str, offset: int) -> int:

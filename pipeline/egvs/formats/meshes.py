@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core import limits, reading
-from egvs.core.digests import hash_input
+from egvs.core.digests import hash_input, unchanged_inputs
 from egvs.core.errors import InputError
 from egvs.core.grid import IntArray
 from egvs.core.platform import relative_path
@@ -214,7 +214,8 @@ def load_mesh(path: Path, where: str) -> trimesh.Trimesh:
         raise InputError(where, f"unknown mesh format {path.suffix!r}", hint)
     with translate_errors(where, MESH_HINT, "cannot be loaded"):
         _check_size(path, where, kind)
-        with _quiet_trimesh(where), np.errstate(all="ignore"):
+        files = (path, *referenced_files(path))
+        with _quiet_trimesh(where), np.errstate(all="ignore"), unchanged_inputs(*files):
             mesh = trimesh.load(path, force="mesh", process=False)
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             raise InputError(where, "the file has no triangles", MESH_HINT)

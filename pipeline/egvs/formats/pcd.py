@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core import limits
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
@@ -60,7 +61,8 @@ class _Header(NamedTuple):
 
 def read(path: Path, where: str) -> FloatArray:
     """Return all points in the world frame, (n, 3) float64; InputError at ``where`` for a damaged file."""
-    data = path.read_bytes()
+    with open_input(path) as file:
+        data = file.read()
     header = _read_header(where, data)
     layout = _layout(where, header.words)
     viewpoint = _viewpoint(where, header.words.get("VIEWPOINT"))
@@ -81,7 +83,8 @@ def read(path: Path, where: str) -> FloatArray:
 
 def stream(path: Path, where: str) -> Iterator[PointChunk]:
     """Yield all points at once, with the position of VIEWPOINT as the station unless it is the identity."""
-    viewpoint = _viewpoint(where, _read_header(where, path.read_bytes()).words.get("VIEWPOINT"))
+    with open_input(path) as file:
+        viewpoint = _viewpoint(where, _read_header(where, file.read()).words.get("VIEWPOINT"))
     station_m = None if viewpoint == _IDENTITY else np.array(viewpoint[:3])
     yield PointChunk(0, station_m, read(path, where))
 

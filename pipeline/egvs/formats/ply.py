@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
@@ -53,7 +54,8 @@ class _Header(NamedTuple):
 
 def read(path: Path, where: str) -> FloatArray:
     """Return the vertices, (n, 3) float64; InputError at ``where`` for a damaged file."""
-    data = path.read_bytes()
+    with open_input(path) as file:
+        data = file.read()
     header = _read_header(where, data)
     names = [element.name for element in header.elements]
     if "vertex" not in names:

@@ -27,6 +27,7 @@ import numpy as np
 
 from egvs.core import files, limits, sandbox
 from egvs.core.child_process import OUT_OF_MEMORY, Confinement, python_files, start_program
+from egvs.core.digests import unchanged_inputs
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE, describe_exception
@@ -141,7 +142,11 @@ def read_blocks(
     """
     command = [sys.executable, "-P", "-m", module, os.fspath(path.resolve()), *arguments]
     seconds = limits.READER_TIME.maximum + _size_mb(path)
-    with files.temporary_folder() as folder, tempfile.TemporaryFile() as errors:
+    with (
+        unchanged_inputs(path, *companions),
+        files.temporary_folder() as folder,
+        tempfile.TemporaryFile() as errors,
+    ):
         confinement = Confinement(
             writable=folder,
             readable=(path.resolve(), *(part.resolve() for part in companions), *python_files()),

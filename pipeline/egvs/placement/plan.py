@@ -21,6 +21,7 @@ from egvs.artefacts import checksums, parquet
 from egvs.artefacts.readers import read_plan_zones
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
+from egvs.core.digests import use_digests
 from egvs.core.errors import InputError, choose_one
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import number_of
@@ -111,7 +112,10 @@ class JointScore:
         context = open_folder(
             scenario, folder, jobs=jobs, progress=progress, recorded=stage_registry.recorded_digests(record)
         )
-        return cls(problem_builder.build_problem(context, lambda done: progress("candidates", done, 0)))
+        with use_digests(context.inputs.digests) as digests:
+            problem = problem_builder.build_problem(context, lambda done: progress("candidates", done, 0))
+            digests.check_unchanged()
+        return cls(problem)
 
     @property
     def candidates(self) -> tuple[str, ...]:
@@ -241,11 +245,13 @@ def place(
         context = open_folder(
             scenario, folder, jobs=jobs, progress=progress, recorded=stage_registry.recorded_digests(record)
         )
-        placed = solve_placement(context, exact=exact, time_limit_s=time_limit_s)
-        inputs_by_stage = {name: record.stages[name].inputs for name in REQUIRED_STAGES}
-        zones = None
-        if scenario.score.zones is not None and placed.sensors:
-            zones = PlanZones.of(context, placed.sensors, moved=placed.refinement is not None)
+        with use_digests(context.inputs.digests) as digests:
+            placed = solve_placement(context, exact=exact, time_limit_s=time_limit_s)
+            inputs_by_stage = {name: record.stages[name].inputs for name in REQUIRED_STAGES}
+            zones = None
+            if scenario.score.zones is not None and placed.sensors:
+                zones = PlanZones.of(context, placed.sensors, moved=placed.refinement is not None)
+            digests.check_unchanged()
         written = write_placement(folder, scenario, placed, inputs_by_stage, zones)
         if zones is not None:
             placed = replace(placed, zone_results=tuple(read_plan_zones(RunFolder(folder).plan_zones)))

@@ -119,7 +119,9 @@ class BackgroundStage:
         error = self._future.exception()
         if error is not None:
             _replace_path(error, self._pending.path, self._context.folder.path)
-        return self._future.result()
+        result = self._future.result()
+        self._context.expect(result.artefacts)
+        return result
 
     def close(self) -> None:
         """End the stage if it still works, remove its folder, and let other processes make its artefacts."""

@@ -17,20 +17,15 @@ from egvs.core.digests import Digests, Entries
 
 
 @contextmanager
-def remember_digests(folder: RunFolder) -> Iterator[Digests]:
-    """Use the digests of the last run in a folder; save those of the block if it ends well."""
-    earlier = _read_entries(folder.digests)
+def remember_digests(folder: RunFolder, *, trusted: bool = True) -> Iterator[Digests]:
+    """Use the digests of the last run in a folder if they are trusted; save those of the block if it ends well."""
+    earlier = _read_entries(folder.digests) if trusted else {}
     with digests.use_digests(Digests(folder.path, earlier=earlier)) as current:
         yield current
     entries = {name: entry for name, entry in sorted(current.entries.items()) if Path(name).exists()}
     if entries != earlier:
         with suppress(OSError):  # a cache that cannot be written costs time, nothing else
             files.write_text(folder.digests, files.to_json_text(files.add_checksum({"files": entries})) + "\n")
-
-
-def forget_digests(folder: Path) -> None:
-    """Remove the saved digests of a run folder: the next run hashes every file."""
-    RunFolder(folder).digests.unlink(missing_ok=True)
 
 
 def _read_entries(path: Path) -> Entries:

@@ -25,6 +25,7 @@ from egvs._version import __version__
 from egvs.artefacts.origin import foreign_files
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
+from egvs.core import files
 from egvs.core.digests import use_digests
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.platform import relative_path
@@ -49,6 +50,7 @@ StageListener = Callable[[str, str, StageRecord | None], None]
 """Called with (stage, state, record) as a run proceeds.
 
 States: "runs" (without a record), then "done"; or "skipped" (nothing changed), or "fetched" (restored from the store).
+"corrected" comes before "done" where the artefacts in the folder were not those that the stage makes of its inputs.
 """
 
 StageOptions = Mapping[str, Mapping[str, Any]]
@@ -108,19 +110,49 @@ def run(
     >>> egvs.read_scores("runs/example/scores.parquet").num_rows == len(egvs.build_scene(scenario).sites)
     True
     """
+    open_context = partial(open_folder, scenario, jobs=jobs, progress=progress)
+    with _start_run(scenario, out, listener, open_context, wait_s) as current:
+        return current.run_stages(only, options or {})
+
+
+def run_rehashed(
+    scenario: Scenario,
+    out: str | Path | None = None,
+    *,
+    jobs: int | None = None,
+    progress: ProgressCallback = no_progress,
+    listener: StageListener = ignore_stage,
+    options: StageOptions | None = None,
+) -> RunRecord:
+    """Run as :func:`run`, but trust neither time stamps nor artefacts that were made of other artefacts.
+
+    Every file is hashed. Scans, TPOG and scores are made again from the artefacts beside them; those in the folder and
+    in the store that differ are replaced, and reported as "corrected".
+    """
+    open_context = partial(open_folder, scenario, jobs=jobs, progress=progress)
+    with _start_run(scenario, out, listener, open_context, is_rehash=True) as current:
+        return current.run_stages(STAGE_NAMES, options or {})
+
+
+@contextmanager
+def _start_run(
+    scenario: Scenario,
+    out: str | Path | None,
+    listener: StageListener,
+    open_context: Callable[..., StageContext],
+    wait_s: float = 0.0,
+    *,
+    is_rehash: bool = False,
+) -> Iterator[_Run]:
+    """Lock a run folder, and yield the run in it."""
+    if out == "":
+        raise InputError("out", "expected a folder, got an empty text", 'Use "." for the current folder.')
     folder = Path(out) if out is not None else default_folder(scenario)
+    files.check_utf8("the run folder", str(folder.absolute()))
     check_no_overwrite(scenario, folder)
-    with lock_run_folder(folder, wait_s), remember_digests(RunFolder(folder)) as digests:
-        context = open_folder(scenario, folder, jobs=jobs, progress=progress, digests=digests)
-        current = _Run(context, start_record(scenario, folder), listener)
-        stages = [stage for stage in STAGE_NAMES if stage in only]
-        key = None
-        if "traffic" in stages and "traffic" not in (options or {}):
-            key = current.key_to_simulate()
-        with run_in_background("traffic", key, context, current.store) as current.background, current.compiler:
-            for number, stage in enumerate(stages, 1):
-                current.ensure_stage(stage, (options or {}).get(stage, {}), next_stages=stages[number:])
-            return current.finish(keep=only, keep_views=True)
+    with lock_run_folder(folder, wait_s), remember_digests(RunFolder(folder), trusted=not is_rehash) as digests:
+        context = open_context(folder, digests=digests)
+        yield _Run(context, start_record(scenario, folder), listener, is_rehash=is_rehash)
 
 
 def run_one(
@@ -267,6 +299,7 @@ def fetch_or_run(
                 return result, False
     for other in set(stage_registry.stage(name).artefacts) - set(entry.made.artefacts):
         (out / other).unlink(missing_ok=True)  # as the stage does
+    context.expect(entry.made.artefacts)
     return entry.made, True
 
 
@@ -301,6 +334,8 @@ class _Run:
         The stages that belong to this scenario for certain.
     has_changed
         Whether the folder has other artefacts than before.
+    is_rehash
+        Whether stages that read artefacts run again, and their artefacts are compared with the recorded ones.
     background
         A stage that has been started before its turn.
     compiler
@@ -313,8 +348,20 @@ class _Run:
     store: Store = field(default_factory=Store.default)
     complete: set[str] = field(default_factory=set)
     has_changed: bool = False
+    is_rehash: bool = False
     background: BackgroundStage | None = None
     compiler: KernelCompiler = field(default_factory=KernelCompiler)
+
+    def run_stages(self, names: Collection[str], options: StageOptions) -> RunRecord:
+        """Bring some stages up to date, in order, while SUMO simulates in the background; return the record."""
+        stages = [stage for stage in STAGE_NAMES if stage in names]
+        key = None
+        if "traffic" in stages and "traffic" not in options:
+            key = self.key_to_simulate()
+        with run_in_background("traffic", key, self.context, self.store) as self.background, self.compiler:
+            for number, stage in enumerate(stages, 1):
+                self.ensure_stage(stage, options.get(stage, {}), next_stages=stages[number:])
+            return self.finish(keep=names, keep_views=True)
 
     def key_to_simulate(self) -> StageKey | None:
         """Return the key of the traffic stage if SUMO has to simulate; None, too, where an error comes before that."""
@@ -340,7 +387,9 @@ class _Run:
         While a stage in the background goes on, what it and ``next_stages`` will call is loaded and compiled.
         """
         key = stage_keys.stage_key(name, self.context)
-        has_options = any(option not in stage_registry.stage(name).neutral_options for option in options)
+        stage = stage_registry.stage(name)
+        has_options = any(option not in stage.neutral_options for option in options)
+        again = again or (self.is_rehash and bool(stage.reads) and not stage.is_view)
         last = self.record.stages.get(name)
         if last and not (again or has_options) and last.inputs == key.key and _is_intact(self.context, last):
             self._record_stage(name, last)
@@ -366,6 +415,8 @@ class _Run:
         else:
             result, fetched = fetch_or_run(name, self.context, key.key, self.store, make)
         stage_record = key.record(result)
+        if self.is_rehash and last and last.inputs == key.key and last.artefacts != stage_record.artefacts:
+            self.listener(name, "corrected", stage_record)
         self.has_changed |= bool(stage_record.artefacts)
         recorded = stage_record
         if last and (last.inputs, last.artefacts) == (stage_record.inputs, stage_record.artefacts):
@@ -392,6 +443,7 @@ class _Run:
         if entry is None:
             return
         self.has_changed = True
+        self.context.expect(entry.made.artefacts)
         self._record_stage(name, key.record(entry.made))
         self.listener(name, "fetched", self.record.stages[name])
 

@@ -15,7 +15,7 @@ import hashlib
 import importlib.util
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -213,7 +213,8 @@ class StageKey:
 
 def stage_key(name: str, context: StageContext) -> StageKey:
     """Return what the artefacts of a stage depend on; the folder contains the artefacts of the stages before it."""
-    dependencies = stage(name).dependencies(context)
+    with context.inputs.digests.collect() as paths:
+        dependencies = replace(stage(name).dependencies(context), paths=paths)
     content = {
         "stage": name,
         "inputs": dependencies.to_json(),

@@ -11,7 +11,8 @@ from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core import files
-from egvs.core.errors import with_relative_paths
+from egvs.core.digests import use_digests
+from egvs.core.errors import InputError, with_relative_paths
 from egvs.core.resource_usage import ResourceUsage, measure_usage
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 
@@ -83,19 +84,31 @@ def recorded_digests(record: RunRecord) -> dict[str, str]:
 
 
 def run_stage(name: str, context: StageContext, dependencies: StageDependencies, **options: Any) -> StageResult:
-    """Run a stage in a folder that contains the artefacts of the stages before it."""
-    running = stage(name)
-    stamps_before = _sidecar_stat(running, context.folder.path)
-    context.forget(*written_by(name))
-    with measure_usage() as cost, parquet.share_open_files():
-        summary = with_relative_paths(context.scenario.folder, running.run(context, dependencies, **options))
+    """Run a stage in a folder that contains the artefacts of the stages before it.
 
-    written = [artefact for artefact in running.artefacts if context.path(artefact).exists()]
+    Raises
+    ------
+    InputError
+        When the input is wrong, or a file that the stage depends on was changed or replaced while it ran.
+    """
+    running, folder, digests = stage(name), context.folder.path, context.inputs.digests
+    stamps_before = _sidecar_stat(running, folder)
+    context.forget(*written_by(name))
+    with measure_usage() as cost, use_digests(digests), files.hash_written_files(folder) as written:
+        with parquet.share_open_files():
+            summary = with_relative_paths(context.scenario.folder, running.run(context, dependencies, **options))
+        digests.check_unchanged(dependencies.paths)
+
+    artefacts = {name: written[name] for name in running.artefacts if name in written and context.path(name).exists()}
+    context.expect(artefacts)
     companions = {}
-    for companion, stamp in sorted(_sidecar_stat(running, context.folder.path).items()):
-        if stamps_before.get(companion) != stamp:
-            companions[companion] = files.hash_file(context.path(companion))
-    return StageResult(context.digests(*written), companions, summary, cost)
+    for companion, stamp in sorted(_sidecar_stat(running, folder).items()):
+        if stamps_before.get(companion) == stamp:
+            continue
+        companions[companion] = files.hash_file(context.path(companion))
+        if companions[companion] != written.get(companion, companions[companion]):
+            raise InputError(context.path(companion), "was changed while it was in use", "Repeat the command.")
+    return StageResult(artefacts, companions, summary, cost)
 
 
 def _sidecar_stat(stage: Stage, folder: Path) -> dict[str, tuple[int, int, int]]:

@@ -136,6 +136,13 @@ class RemoteStore:
                 self._fs.makedirs(posixpath.dirname(path), exist_ok=True)
                 self._fs.put_file(str(folder / file), path)
 
+    def remove(self, name: str) -> None:
+        """Remove an entry, if it exists."""
+        with translate_errors(self.url, _LOCATION_HINT, "cannot be written"):
+            self._fs.invalidate_cache()
+            if self._fs.exists(self._path(name)):
+                self._fs.rm(self._path(name), recursive=True)
+
     def _path(self, *parts: str) -> str:
         return posixpath.join(self._root, *parts)
 
@@ -522,11 +529,20 @@ class Store:
             yield True
 
     def put(self, stage: str, key: str, out: Path, result: StageResult, *, link: bool = False) -> None:
-        """Save the result of a stage in ``out``, unless the entry exists already; within its :meth:`maker`."""
+        """Save the result of a stage in ``out``; within its :meth:`maker`.
+
+        An entry with the same digests stays; one with other digests is wrong, since the result was just made from
+        inputs that were verified, and is replaced.
+
+        Raises
+        ------
+        InputError
+            When a file of the result was changed or replaced after it was written.
+        """
         if not self._can_write or self.folder is None:
             return
         final = self._entry_folder(stage, key)
-        if final.exists():
+        if final.exists() and not self._removed_wrong(final, stage, result):
             return
         work = self.folder / ".work" / final.name
         try:
@@ -534,6 +550,8 @@ class Store:
             work.mkdir(parents=True)
             for name in result.files:
                 _copy_or_link(out / name, work / name, link)
+                if files.hash_file(work / name) != result.files[name]:
+                    raise InputError(out / name, "was changed while it was in use", "Repeat the command.")
             (work / ENTRY_FILE).write_text(_entry_to_json(stage, key, work, result), encoding="utf-8")
             usage = self._add(work, final, sum((work / name).stat().st_size for name in result.files))
             self._call_remote(lambda remote: remote.put(final.name, final, result.files))
@@ -543,6 +561,20 @@ class Store:
             self._stop_writing(error)
         finally:
             shutil.rmtree(work, ignore_errors=True)
+
+    def _removed_wrong(self, final: Path, stage: str, result: StageResult) -> bool:
+        """Remove an entry whose digests are not those of a result, here and in the shared store; return whether."""
+        assert self.folder is not None
+        try:
+            if _read_entry(final).made.artefacts == result.artefacts:
+                return False
+        except _DamagedEntry:
+            pass
+        self._note(f"{final}: the cached {stage} is not what its inputs give and is replaced")
+        with locked(self.folder / ".lock"):
+            self._remove(final)
+        self._call_remote(lambda remote: remote.remove(final.name))
+        return True
 
     # ---- all entries
 

@@ -8,6 +8,7 @@ accepted as tuples, as in JSON.
 from __future__ import annotations
 
 import json
+import unicodedata
 from collections.abc import Sequence
 from typing import Annotated, Any, Self
 
@@ -27,8 +28,20 @@ class StrictModel(BaseModel):
 
 
 def find_duplicates(names: Sequence[Any]) -> list[Any]:
-    """Return the names that occur more than once, sorted."""
-    return sorted({name for name in names if names.count(name) > 1})
+    """Return the names that occur more than once, sorted; accents may be written in two ways."""
+    same = [same_name(name) if isinstance(name, str) else name for name in names]
+    return sorted({name for name, form in zip(names, same, strict=True) if same.count(form) > 1})
+
+
+def same_name(name: str) -> str:
+    """Return the form in which names are compared: Unicode's NFC, in which each accented letter is one character.
+
+    Examples
+    --------
+    >>> same_name("e\N{COMBINING ACUTE ACCENT}") == "\N{LATIN SMALL LETTER E WITH ACUTE}"
+    True
+    """
+    return unicodedata.normalize("NFC", name)
 
 
 MAX_COORDINATE_M = 1e8

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
-from egvs.core import reading
+from egvs.core import files, reading
 from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
 from egvs.scenario.fields import NAME_DESCRIPTION
@@ -175,6 +175,7 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     (70.0, 70.0, 5.0)
     """
     path = Path(path)
+    files.check_utf8("the scenario", str(path.absolute()))
     overrides = tuple(overrides)
     file = path / SCENARIO_FILE if path.is_dir() else path
     values = apply_overrides(_read_with_bases(file, ()), overrides)

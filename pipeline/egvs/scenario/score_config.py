@@ -59,6 +59,10 @@ _GAMMA_AT_1_M, _GAMMA_EXPONENT = 10.0, 1.16
 0.25, 0.5 and 1 m; 1, 2 and 5 with moving occlusion. It interpolates three values each, measured with one sensor."""
 
 
+MIN_GAMMA = 1e-9
+"""Smallest gamma above 0."""
+
+
 def default_gamma(voxel_m: float, *, moving_occlusion: bool) -> float:
     r"""Return the gamma that ``"auto"`` stands for, to two significant digits.
 
@@ -142,8 +146,8 @@ class ScoreConfig(StrictModel):
 
     gamma: Annotated[float, Field(ge=0, allow_inf_nan=True)] | Literal["auto"] = Field(
         "auto",
-        description="Cap of the beams that count in one voxel; may be inf. 'auto' depends on the size of voxels: "
-        "10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), and half of that with moving_occlusion",
+        description="Cap of the beams that count in one voxel: 0, at least 1e-9, or inf. 'auto' depends on the "
+        "size of voxels: 10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), and half of that with moving_occlusion",
     )
     rank_by: Literal["egvs", OtherScore] = Field("egvs", description="Score that sites are ranked by")
     others: tuple[OtherScore, ...] = Field(
@@ -184,6 +188,14 @@ class ScoreConfig(StrictModel):
     def _parse_inf(cls, gamma: Any) -> Any:
         """JSON has no infinity: it is written as text."""
         return math.inf if gamma == "inf" else gamma
+
+    @field_validator("gamma")
+    @classmethod
+    def _check_gamma(cls, gamma: float | str) -> float | str:
+        """Squares of scores, which standard errors need, are 0 where all scores are tiny."""
+        if isinstance(gamma, float) and 0.0 < gamma < MIN_GAMMA:
+            raise ValueError(f"expected 0, or at least {MIN_GAMMA:g}, got {gamma:g}")
+        return gamma
 
     @field_validator("others")
     @classmethod

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from egvs.artefacts import parquet
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray
+from egvs.core.wording import list_first
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scoring.scorer import SiteScore, ranks
 from egvs.scoring.standard_errors import BlockGroups, LagBehindBest, ScoreUncertainty, beats_next, lag_behind_best
@@ -34,6 +35,9 @@ MIX = ""
 
 ALL_TRAFFIC = 0
 """Replicate with all traffic; replicates 1, 2, ... leave out one group of blocks each."""
+
+_MAX_LISTED_SITES = 5
+"""Sites that a warning names."""
 
 JACKKNIFE_TOTAL = -1
 """Replicate with all traffic, summed in the order of the other replicates: the last bits of an EGVS can differ from
@@ -291,6 +295,29 @@ def warn_all_zero(column: ScoreColumn, gamma: float, limit: float) -> Iterator[D
         hint = "Move or enlarge the region of interest."
     problem = f"{column.name} is 0 at every site, so there is no ranking: {reason}"
     yield Diagnostic("no ranking", f"{SCENARIO_FILE}: {key}", problem, hint)
+
+
+def warn_blind_sites(column: ScoreColumn, sites: Sequence[str], returned_shares: FloatArray) -> Iterator[Diagnostic]:
+    """Warn about sites with a score of 0 where others score more, for example inside a building without a floor.
+
+    Parameters
+    ----------
+    column
+        The score that ranks.
+    sites
+        Names of the sites.
+    returned_shares
+        Share of the beams of each site towards the region that meet something, (n,) float64.
+    """
+    if not np.any(column.values > 0):
+        return  # warn_all_zero
+    blind = np.flatnonzero(column.values == 0).tolist()
+    if not blind:
+        return
+    listed = list_first([f"{sites[i]} ({100 * returned_shares[i]:.0f} %)" for i in blind], _MAX_LISTED_SITES)
+    problem = f"{column.name} is 0 at {listed}; in brackets, the beams that end on the static world"
+    hint = "Check whether each stands inside a building (a mesh without a floor is no closed solid) or looks away."
+    yield Diagnostic("blind sites", f"{SCENARIO_FILE}: sites", problem, hint)
 
 
 def warn_additional_all_zero(column: ScoreColumn) -> Iterator[Diagnostic]:

@@ -25,6 +25,7 @@ from __future__ import annotations
 import csv
 import difflib
 import hashlib
+import io
 import math
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -36,7 +37,7 @@ import numpy as np
 from pydantic import Field
 
 from egvs.core import files, limits
-from egvs.core.digests import hash_input
+from egvs.core.digests import hash_input, open_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import number_or_nan, parse_decimal
@@ -131,7 +132,7 @@ def _read_cached(path: Path, _content_hash: str) -> BeamTable:
     max_beams = limits.BEAMS.maximum
     limits.checked_size(path, limits.FILE)
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with open_input(path) as content, io.TextIOWrapper(content, "utf-8-sig", newline="") as file:
             rows = csv.DictReader(file, skipinitialspace=True)
             names = list(rows.fieldnames or ())
             _check_beam_columns(path, names)
@@ -318,6 +319,12 @@ class Sensor:
         matrix = rotation_world_sensor(yaw_deg, pitch_deg, roll_deg)
         # Written out: a BLAS may sum in another order on another machine.
         return rays[:, :1] * matrix[:, 0] + rays[:, 1:2] * matrix[:, 1] + rays[:, 2:] * matrix[:, 2]
+
+    @property
+    def beam_table(self) -> BeamTable:
+        """All beams in order, as a table."""
+        elevation, azimuth = np.broadcast_arrays(*self._angles_deg(0.0))
+        return BeamTable(elevation.ravel(), azimuth.ravel())
 
     def _angles_deg(self, yaw_deg: float) -> tuple[FloatArray, FloatArray]:
         """Elevations and azimuths that broadcast to all beams in order, turned by ``yaw_deg``."""

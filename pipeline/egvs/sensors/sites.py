@@ -37,7 +37,7 @@ from egvs.core.grid import Vec3
 from egvs.core.special import cosdg, sindg
 from egvs.core.wording import list_first
 from egvs.formats import vector_files
-from egvs.scenario.fields import MAX_COORDINATE_M
+from egvs.scenario.fields import MAX_COORDINATE_M, same_name
 from egvs.scenario.model import Scenario, SiteGrid, SiteLine
 from egvs.sensors import site_files
 from egvs.sensors.sensor import Sensor, scenario_sensor
@@ -169,12 +169,17 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
         path = scenario.find(scenario.sites.file, "sites.file")
     builder = _SiteBuilder(scenario)
     sites: dict[str, Site] = {}
+    names: dict[str, str] = {}
     errors: list[InputError] = []
     for row in _site_rows(scenario, path):
         try:
             for site in builder.candidates(row):
+                other = names.setdefault(same_name(site.name), site.name)
                 if site.name in sites:
                     raise InputError(row.where, f"there are two sites {site.name!r}", "Give each site its own name.")
+                if other != site.name:
+                    problem = f"the sites {other!a} and {site.name!a} differ only in the Unicode of accents"
+                    raise InputError(row.where, problem, "Give each site its own name.")
                 sites[site.name] = site
         except InputError as error:
             errors.append(error)

@@ -43,12 +43,15 @@ class StageDependencies:
         Further dependencies, for example the version of SUMO.
     modules
         Modules that are loaded by name and whose source counts: active effects, readers of measured scans.
+    paths
+        The files by real path, to check after the stage that they did not change while it ran.
     """
 
     settings: Json
     files: Mapping[str, str]
     more: Json = field(default_factory=dict)
     modules: tuple[str, ...] = ()
+    paths: Mapping[str, Path] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return the JSON value that is hashed."""
@@ -174,6 +177,10 @@ class StageContext:
     def digests(self, *artefacts: str) -> dict[str, str]:
         """Return the sha256 of some artefacts, by name."""
         return {name: self.digest(name) for name in artefacts}
+
+    def expect(self, digests: Mapping[str, str]) -> None:
+        """Note the sha256 of artefacts that were just written or restored, by name."""
+        self.inputs.digests.expect({self.path(name): digest for name, digest in digests.items()})
 
     def forget(self, *names: str) -> None:
         """Forget the digests of artefacts, or of all files in a folder, that are about to be written."""

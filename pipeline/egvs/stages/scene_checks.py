@@ -22,6 +22,7 @@ from egvs.core.wording import by_number, format_percent, list_first, number_of, 
 from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.kernels import ray_triangle
+from egvs.scenario.model import SCENARIO_FILE
 from egvs.sensors import sensor, site_feasibility
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor, scenario_sensor
@@ -109,26 +110,27 @@ def check_sensors_known(inputs: CheckInputs) -> Iterator[Diagnostic]:
 
 
 def warn_repeated_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
-    """Warn about beam tables that contain a direction twice."""
+    """Warn about beam tables, and rings, that contain a direction twice; a scan pattern may come back to one."""
     scenario = inputs.scenario
     for name in dict.fromkeys(site.sensor for site in inputs.sites):
         config = scenario.sensors.get(name)
-        if config is None or config.beams is None:
+        if config is None or config.pattern is not None:
             continue
         try:
-            table = scenario_sensor(name, scenario, name).table
+            table = scenario_sensor(name, scenario, name).beam_table
         except InputError:
             continue  # check_sensors_known reports it
-        repeated = sensor.repeated_beams(table) if table is not None else ()
-        if table is None or not repeated:
+        repeated = sensor.repeated_beams(table)
+        if not repeated:
             continue
+        where = config.beams or f"{SCENARIO_FILE}: sensors.{name}.elevations_deg"
         listed = list_first([f"beam {beam} = beam {first}" for beam, first in repeated], MAX_LISTED_BEAMS)
         problem = (
             f"{len(repeated)} of {len(table)} beams have the same direction as an earlier one ({listed})"
             " and count twice"
         )
         hint = "List each direction once; azimuths of 0 and 360 degrees are the same."
-        yield Diagnostic("repeated beams", config.beams, problem, hint)
+        yield Diagnostic("repeated beams", where, problem, hint)
 
 
 def check_effects(inputs: CheckInputs) -> Iterator[Diagnostic]:

@@ -19,6 +19,7 @@ from egvs.artefacts.extra_columns import extra_columns
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import WARNINGS_KEY, Diagnostic
+from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
 from egvs.effects import registry
 from egvs.effects.base import Effect
@@ -246,7 +247,7 @@ def _summary(
         summary |= standard_errors.summarise_uncertainty(ranking.estimate, scores.periods or (score_table.MIX,))
     if audit:
         summary["audit"] = asdict(BeamAudit.worst([site.audit for site in sites if site.audit is not None]))
-    warnings = list(_warnings(context, scoring, scores))
+    warnings = list(_warnings(context, scoring, sites, scores))
     if not context.scenario.scan.keep:  # the scan stage has not seen these beams
         warnings += warn_blocked_sites({site.site.name: site.near_share for site in sites})
     if warnings:
@@ -287,13 +288,21 @@ def warn_period_disagreements(scores: ScoreTable, rank_by: str) -> Iterator[Diag
         yield Diagnostic("periods disagree", f"{SCENARIO_FILE}: traffic.periods ({period})", problem, hint)
 
 
-def _warnings(context: StageContext, scoring: SiteScoring, scores: ScoreTable) -> Iterator[Diagnostic]:
+def _returned_shares(sites: Sequence[ScoredSite]) -> FloatArray:
+    """Share of the beams of each site towards the region that meet something; 0 without beams."""
+    return np.array([scored.site.returns / max(1, scored.site.beams_in_roi) for scored in sites])
+
+
+def _warnings(
+    context: StageContext, scoring: SiteScoring, sites: Sequence[ScoredSite], scores: ScoreTable
+) -> Iterator[Diagnostic]:
     """Warnings about the scores, those about the ranking first."""
     scenario = context.scenario
     rank_by = scenario.score.rank_by
     ranking = scores.column(rank_by)
     others = [scores.column(name) for name in ("egvs", *scenario.score.additional) if name != rank_by]
     yield from score_table.warn_all_zero(ranking, scenario.gamma, scores.limits[score_table.MIX])
+    yield from score_table.warn_blind_sites(ranking, scores.sites, _returned_shares(sites))
     if ranking.estimate is not None:
         yield from _warn_short_traffic(scenario, ranking.estimate, scores.periods or (score_table.MIX,))
     yield from warn_period_disagreements(scores, rank_by)

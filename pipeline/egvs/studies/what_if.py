@@ -11,8 +11,9 @@ Errors are those of the same frames: the block jackknife leaves out the same gro
 (:mod:`egvs.studies.paired_errors`), and the replicates are mixed as the scores are. Traffic does not react: vehicles
 drive through a solid that stands in their lane, and those hidden inside it count as missed.
 
-Of several tables, the changes are added, as if they did not hide each other's gaps:
-:math:`S_0 + \sum_i q_i (S_i - S_0)`.
+Of several tables, each leaves its share of the score that the others leave, as if they were independent of each other:
+:math:`S_0 \prod_i (1 + q_i (S_i - S_0) / S_0)`. This is never below 0, and never above what the worst table leaves.
+Where solids of two tables hide the same vehicles, the true value is higher.
 
 The solids are written to the run folders, as ``what_if_1.geojson`` and so on.
 """
@@ -325,7 +326,7 @@ def compare_runs(runs: Sequence[WhatIfRun], run_one: Callable[[int, WhatIfRun], 
     mixes = [{number: runs[number].share} for number in range(1, len(runs))]
     if len(mixes) > 1:
         mixes.append({number: runs[number].share for number in range(1, len(runs))})
-        notes.append(f"{TOGETHER}: the changes by each table are added, as if they were independent of each other")
+        notes.append(f"{TOGETHER}: each table leaves its share of the score, as if it were independent of the others")
     answers = [_answer(runs, by_name, replicates, shares, best.site) for shares in mixes]
     scored = [_site_scores(name, by_name, mixes) for name in by_name[0]]
     shown = [site for site in scored if _is_shown(site, scored)]
@@ -567,9 +568,16 @@ def expected_values(before: FloatArray, present: Sequence[FloatArray], shares: S
     --------
     >>> expected_values(np.array([0.8]), [np.array([0.4])], [0.25]).tolist()
     [0.7]
+    >>> expected_values(np.array([0.8]), [np.array([0.4]), np.array([0.2])], [0.5, 1.0]).round(9).tolist()
+    [0.15]
     """
-    changes = [share * (values - before) for share, values in zip(shares, present, strict=True)]
-    return before + sum(changes, np.zeros_like(before))
+    means = [before + share * (values - before) for share, values in zip(shares, present, strict=True)]
+    expected, *others = means
+    for mean in others:
+        # without a score to lose, solids can only add
+        left = np.divide(mean, before, out=np.zeros_like(mean), where=before != 0)
+        expected = np.where(before != 0, expected * left, expected + mean)
+    return expected
 
 
 def _answer(

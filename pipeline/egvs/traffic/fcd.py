@@ -26,6 +26,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from egvs.core import limits, reading
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.wording import number_of
 from egvs.formats import arrow_bounds, xml
@@ -222,7 +223,8 @@ def _open_seekable(path: Path) -> Iterator[Path | IO[bytes]]:
             plain.seek(0)
             yield plain
     else:
-        yield path
+        with open_input(path) as file:
+            yield file
 
 
 def fcd_metadata(path: Path) -> bytes | None:
@@ -251,7 +253,7 @@ def _read_xml(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]
     for step in xml.iter_elements(path, "fcd-export"):
         steps.add(step.get("time", ""))
         for child in step.iter(element):
-            row = {"time": step.get("time", ""), **child.attrib}
+            row = {**child.attrib, "time": step.get("time", "")}
             if element == "person":
                 row.pop("slope", None)
             rows.append(row)
@@ -312,8 +314,13 @@ def _source_columns(names: list[str], path: Path, element: str) -> dict[str, str
     """Return the column of the file for each column that is used (x is ``vehicle_x`` in CSV and Parquet)."""
     columns: dict[str, str] = {}
     for source in names:
-        if not source.startswith(_OTHER_PREFIXES[element]):
-            columns.setdefault(source.removeprefix(f"{element}_").removeprefix("timestep_"), source)
+        if source.startswith(_OTHER_PREFIXES[element]):
+            continue
+        name = source.removeprefix(f"{element}_").removeprefix("timestep_")
+        other = columns.setdefault(name, source)
+        if name in (*_REQUIRED_COLUMNS, *_OPTIONAL_DEFAULTS) and (other != source or names.count(source) > 1):
+            problem = f"the columns {other!r} and {source!r} both stand for {name!r}"
+            raise InputError(path, problem, "Remove one of them.")
     for name in _REQUIRED_COLUMNS:
         if name not in columns:
             raise InputError(path, f"there is no column for {name!r} among {', '.join(names)[:200]}", EXPECTED_FCD)

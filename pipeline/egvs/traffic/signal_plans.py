@@ -86,7 +86,7 @@ def apply_plans(scenario: Scenario, path: Path, source: Path) -> None:
             raise InputError(
                 source, f"signal programs cannot be replaced: {error}", "Convert it with netconvert."
             ) from None
-        path.write_text(text, encoding="utf-8")
+        files.write_text(path, text)
 
 
 def signal_files(scenario: Scenario) -> list[Path]:

@@ -95,7 +95,22 @@ class Allowance:
 
 
 def sumo_binary(name: str) -> Path:
-    """Find a program of SUMO in the environment, SUMO_HOME, the wheel or PATH."""
+    """Find a program of SUMO in the environment, SUMO_HOME, the wheel or PATH.
+
+    Raises
+    ------
+    InputError
+        When an environment variable names a program or a folder that does not exist.
+    MissingBackendError
+        When SUMO is not installed.
+    """
+    variable = f"{name.upper()}_BINARY"
+    if named := os.environ.get(variable):
+        program = shutil.which(named)
+        if program is None:
+            hint = "Set it to the path of the program, or unset it to use the installed one."
+            raise InputError(variable, f"expected a program, got {named!r}", hint)
+        return Path(program)
     program = _bundled_binary(name)
     if program is None:
         import sumolib  # takes 0.1 s, which a run without changes need not spend
@@ -108,9 +123,7 @@ def sumo_binary(name: str) -> Path:
 
 
 def _bundled_binary(name: str) -> str | None:
-    """Return a program in SUMO's folder; None where it is not there, or an environment variable names another."""
-    if f"{name.upper()}_BINARY" in os.environ:
-        return None
+    """Return a program in SUMO's folder; None where it is not there."""
     try:
         home = sumo_home()
     except MissingBackendError:

@@ -520,8 +520,8 @@ def convert_osm_to_network(path: Path, network_path: Path) -> None:
     """Convert an OpenStreetMap map to a network, whose origin is at its south-west corner."""
     with _CONVERSION_LOCK:
         content = _convert_osm_once(path, hash_input(path))
-    with files.attach_filename(network_path):
-        network_path.write_bytes(content)
+    with files.atomic_write(network_path) as partial:
+        partial.write_bytes(content)
 
 
 @lru_cache(maxsize=1)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core import files
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 
 _VERTEX = np.dtype([("xyz", "<f8", 3)])
@@ -129,7 +130,8 @@ def read_ply(path: Path) -> tuple[World, dict[str, Any]]:
     """Read a world and its metadata from a file that :func:`write_ply` wrote; InputError for any other file."""
     if not path.is_file():
         raise InputError(path, "no such file", f"Run the stage that writes {path.name} first.")
-    head, end, body = path.read_bytes().partition(b"end_header\n")
+    with open_input(path) as file:
+        head, end, body = file.read().partition(b"end_header\n")
     try:
         header = _parse_header(head.decode("ascii"))
         size = header.vertices * _VERTEX.itemsize

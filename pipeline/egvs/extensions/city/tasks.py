@@ -416,6 +416,7 @@ def _fetch_or_score(scoring: SiteScoring, score_key: str, names: tuple[str, ...]
             return entry.made.cost
         with measure_usage() as cost:
             write_part(path, score_stored_scans(scoring, names))
+        scoring.context.inputs.digests.check_unchanged()
         result = StageResult({PART_FILE: files.hash_file(path)}, {}, {}, cost)
         part_store.put(PART_KIND, key, folder, result)
     return cost

@@ -26,7 +26,8 @@ from egvs.scoring.visibility import Beams
 from egvs.sensors.sensor import BeamTable, Sensor
 from egvs.sensors.sites import Pose
 from egvs.world.ray_casting import Caster
-from tests.extensions.hardware.installation.conftest import InstalledRun
+from tests.conftest import collection, feature
+from tests.extensions.hardware.installation.conftest import InstalledRun, write_installed_scenario
 from tests.extensions.hardware.installation.simulated_scan import (
     box,
     simulate_scan,
@@ -313,6 +314,40 @@ def test_rejects_scan_that_cannot_be_one(installed: InstalledRun, run_egvs: Any,
     assert f"{name}.ply" in errors
     assert message in errors
     assert not (tmp_path / "out").exists()
+
+
+def write_street(folder: Path, *more: tuple[str, list[list[float]], float]) -> InstalledRun:
+    """Make a run of a street whose two sides are alike, about the sensor at (10, 0, 5), with more houses."""
+    scenario = write_installed_scenario(folder / "street")
+    north = [[-20.0, 9.0], [60.0, 9.0], [60.0, 20.0], [-20.0, 20.0]]
+    south = [[x, -y] for x, y in north]
+    end = [[70.0, -9.0], [80.0, -9.0], [80.0, 9.0], [70.0, 9.0]]
+    houses = (("north", north, 9.0), ("south", south, 9.0), ("end", end, 12.0), *more)
+    features = [
+        feature({"type": "Polygon", "coordinates": [[*ring, ring[0]]]}, name=name, kind="building", height_m=height)
+        for name, ring, height in houses
+    ]
+    (scenario / "statics.geojson").write_text(collection(*features))
+    (scenario / "sites.csv").write_text("site,x_m,y_m,z_m,yaw_deg,pitch_deg\npole_a,10,0,5,0,-5\n")
+    egvs.run(egvs.load(scenario), folder / "run", jobs=1)
+    (folder / "scans").mkdir()
+    return InstalledRun(folder / "run", folder / "scans")
+
+
+def test_rejects_mirrored_scan_of_a_street_whose_sides_are_almost_alike(tmp_path: Path) -> None:
+    """All but one house fit the mirrored scan at the planned pose."""
+    street = write_street(tmp_path, ("kiosk", [[18, 4], [24, 4], [24, 8], [18, 8]], 4.0))
+    scan = street.points()
+    assert "tilt" not in failed(accept_points(street, scan))
+    assert not any("mirror" in note for note in accept_points(street, scan).notes)
+    with pytest.raises(InputError, match="fits the static world better as its mirror image"):
+        accept_points(street, scan * [1.0, -1.0, 1.0])
+
+
+def test_scan_whose_mirror_image_fits_as_well_gets_a_note(tmp_path: Path) -> None:
+    street = write_street(tmp_path)
+    for scan in (street.points(), street.points() * [1.0, -1.0, 1.0]):
+        assert "the mirror image of the scan fits as well" in " ".join(accept_points(street, scan).notes)
 
 
 def test_rejects_scan_of_another_place(installed: InstalledRun) -> None:

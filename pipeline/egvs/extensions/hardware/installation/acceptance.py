@@ -46,7 +46,9 @@ MAX_DISPLACEMENT_M = 3.0
 """A registration that ends farther from the planned position has not found the pose."""
 
 _GOOD_STRUCTURE_SHARE = 0.6
-"""Below it, other yaws are tried, and whether the scan is mirrored."""
+"""Below it, other yaws are tried."""
+_MIRROR_MARGIN = 0.02
+"""A scan whose mirror image agrees with so much more of the structure is mirrored; within it, nothing can tell."""
 _MIRROR = np.array([1.0, -1.0, 1.0])
 _BLOCKED_BEAM_DEG = 0.3
 """An expected beam is stopped by the return of an obstacle that is at most this far beside it."""
@@ -337,10 +339,11 @@ def accept(
     world = StaticWorld(scene, planned.pose)
     surfaces = StaticSurfaces(scene.world, planned.pose.position_m)
     fit, comparison, others = _register(clouds, sensor, planned, surfaces, world, where, max_vehicle_height_m)
+    mirror_note = _check_not_mirrored(clouds, sensor, planned.pose, surfaces, world, where, _structure(comparison))
     progress("registered", 2, steps)
 
     error = PoseError.of(planned.pose, fit, others)
-    notes = list(_notes(fit, comparison, others))
+    notes = [*_notes(fit, comparison, others), *mirror_note]
     score = _score_change(planned_sites.session, planned, fit.pose, comparison, notes)
     progress("scored", 3, steps)
     checks = tuple(_checks(error, comparison, score, limits))
@@ -401,12 +404,10 @@ def _register(
         best = search.best
         comparison = scan_comparison.compare_scans(clouds, sensor, best.pose, world, max_vehicle_height_m)
         share = _structure(comparison) if _is_plausible(best, start) else 0.0
-    if share < _GOOD_STRUCTURE_SHARE:
+    if search is None or share < MIN_STRUCTURE_SHARE:
         mirrored = [cloud * _MIRROR for cloud in clouds]
         if _mirror_share(mirrored, sensor, start, surfaces, world) > max(share, _GOOD_STRUCTURE_SHARE):
-            problem = "the scan fits the static world as its mirror image only"
-            raise InputError(where, problem, "Export y to the left of x: azimuths count counter-clockwise from above.")
-    if search is None or share < MIN_STRUCTURE_SHARE:
+            raise _mirrored_error(where)
         raise InputError(where, problem, hint)
     equally_good = [other.registration for other in search.equally_good]
     return best, comparison, tuple(other.pose.yaw_deg for other in equally_good if _is_near(other, start))
@@ -438,6 +439,33 @@ def _is_plausible(fit: Registration, planned: Pose) -> bool:
     return fit.converged and _is_near(fit, planned)
 
 
+def _check_not_mirrored(
+    clouds: Sequence[FloatArray],
+    sensor: Sensor,
+    start: Pose,
+    surfaces: StaticSurfaces,
+    world: StaticWorld,
+    where: str,
+    share: float,
+) -> list[str]:
+    """Return a note where the mirror image of the scans fits as well as they do; InputError where it fits better.
+
+    In a street whose sides are alike, a mirrored scan agrees with most of the structure.
+    """
+    mirrored = [cloud * _MIRROR for cloud in clouds]
+    gain = _mirror_share(mirrored, sensor, start, surfaces, world) - share
+    if gain > _MIRROR_MARGIN:
+        raise _mirrored_error(where)
+    if gain < -_MIRROR_MARGIN:
+        return []
+    return ["the mirror image of the scan fits as well: check that azimuths count counter-clockwise from above"]
+
+
+def _mirrored_error(where: str) -> InputError:
+    problem = "the scan fits the static world better as its mirror image"
+    return InputError(where, problem, "Export y to the left of x: azimuths count counter-clockwise from above.")
+
+
 def _mirror_share(
     mirrored: Sequence[FloatArray], sensor: Sensor, start: Pose, surfaces: StaticSurfaces, world: StaticWorld
 ) -> float:
@@ -448,7 +476,7 @@ def _mirror_share(
         return 0.0
     if not _is_plausible(fit, start):
         return 0.0
-    return scan_comparison.compare_scans(mirrored, sensor, fit.pose, world).structure_share
+    return _structure(scan_comparison.compare_scans(mirrored, sensor, fit.pose, world))
 
 
 def _structure(comparison: ScanComparison) -> float:
