@@ -27,8 +27,6 @@ from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE
-from egvs.formats import parquet_process
-from egvs.formats.gdal_layers import FEATURE_BYTES, read_layer
 
 GIS_FORMATS = {
     ".gpkg": "GeoPackage", ".shp": "Shapefile", ".kml": "KML", ".parquet": "GeoParquet", ".geoparquet": "GeoParquet",
@@ -94,6 +92,9 @@ def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str
     plugins.require_libraries(f"{path.name}: reading {kind}", "gis", "pyogrio")
     if kind == "Shapefile":
         _check_shapefile_complete(path)
+
+    from egvs.formats.gdal_layers import read_layer
+
     return read_layer(path, kind, geometry, companion_files(path))
 
 
@@ -127,6 +128,8 @@ def _check_shapefile_complete(path: Path) -> None:
 
 def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
     """Return the table of a GeoParquet file, the name of its geometry column, and its reference system."""
+    from egvs.formats import parquet_process
+
     doing = "the file cannot be read as GeoParquet"
     header = parquet_process.read_header(path, doing)
     try:
@@ -150,6 +153,9 @@ def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
 
 def _bounded_table(path: Path, doing: str, columns: list[str]) -> pa.Table:
     """Return columns of a file that is small enough to be held as features."""
+    from egvs.formats import parquet_process
+    from egvs.formats.gdal_layers import FEATURE_BYTES
+
     batches = []
     size = 0
     for batch in parquet_process.read_batches(path, doing, columns):

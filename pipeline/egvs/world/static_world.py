@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,10 @@ from egvs.scenario.model import MeshConfig, Scenario
 from egvs.world import geolocation
 from egvs.world.extrusion import extrude_polygon
 from egvs.world.footprints import Footprint, read_footprints
-from egvs.world.map_features import SolidTypes
 from egvs.world.mesh import World
-from egvs.world.sumo_polygons import read_poly_xml
-from egvs.world.terrain import GroundSource, TerrainSurface
+
+if TYPE_CHECKING:
+    from egvs.world.terrain import GroundSource, TerrainSurface
 
 Floats = NDArray[np.float64]
 
@@ -83,10 +83,14 @@ def build_world(
     config = scenario.statics
     builder = _Builder()
     world = geolocation.scenario_georeference(scenario)
-    types = SolidTypes(config.polygon_types)
     files = [read_footprints(scenario.find(name, "statics.footprints"), world) for name in config.footprints]
-    polygons = [scenario.find(name, "statics.polygons") for name in config.polygons]
-    files += [read_poly_xml(path, types, config.polygon_height_m, world) for path in polygons]
+    if config.polygons:
+        from egvs.world.map_features import SolidTypes
+        from egvs.world.sumo_polygons import read_poly_xml
+
+        types = SolidTypes(config.polygon_types)
+        polygons = [scenario.find(name, "statics.polygons") for name in config.polygons]
+        files += [read_poly_xml(path, types, config.polygon_height_m, world) for path in polygons]
     footprints = []
     for file in files:
         footprints += file.footprints
