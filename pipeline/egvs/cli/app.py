@@ -264,7 +264,7 @@ def _run_stage(
         record = run.run_one(
             stage, loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **stage_options
         )
-    run_tables.print_stage(folder, stage, record, top=top)
+    run_tables.print_stage_files(folder, stage, record, top=top)
 
 
 @app.command()
