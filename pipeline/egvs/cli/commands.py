@@ -122,10 +122,7 @@ def extension_commands(extension: str) -> dict[str, Any]:
     MissingBackendError
         When the entry point cannot be loaded, or is no tuple of :class:`Command`.
     """
-    declared = plugins.load_plugin(GROUP, extension)
-    if not (isinstance(declared, tuple) and all(isinstance(command, Command) for command in declared)):
-        raise plugins.plugin_error(GROUP, extension, "expected a tuple of egvs.cli.commands.Command")
-    return _typer_commands(declared)
+    return _typer_commands(plugins.load_rows(GROUP, extension, Command))
 
 
 def _typer_commands(declared: Iterable[Command]) -> dict[str, Any]:
