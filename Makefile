@@ -135,7 +135,7 @@ schema: $(VENV)/.installed
 	$(BIN)/python -c "from egvs.scenario.loading import json_schema; print(json_schema(), end='')" > data_schemas/scenario.schema.json
 	$(BIN)/python -c "from egvs.extensions.city.model import city_json_schema; print(city_json_schema(), end='')" > data_schemas/city_file.schema.json
 
-# The reference pages: every scenario key, every artefact column. Run it after `make schema`.
+# The reference pages: every scenario key, every artefact column, every module. Run it after `make schema`.
 reference: $(VENV)/.installed
 	$(BIN)/python docs/mkdocs/reference.py
 

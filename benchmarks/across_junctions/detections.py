@@ -38,7 +38,7 @@ from egvs.extensions.validation.detection_metrics import (
 from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME, DetectedBoxes, PointCounts
 from egvs.extensions.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
 from egvs.extensions.validation.held_out_traffic import HeldOutTraffic
-from egvs.kernels.detection import OVERLAP_TOLERANCE
+from egvs.extensions.validation.kernels.detection import OVERLAP_TOLERANCE
 from egvs.runs import stage_keys
 from egvs.stages import scene_inputs
 

@@ -1,11 +1,13 @@
-"""Write the reference pages of the documentation: every scenario key and every artefact column, as Markdown.
+"""Write the reference pages of the documentation: every scenario key, artefact column and module, as Markdown.
 
-``make reference`` writes ``docs/scenario-keys.md`` and ``docs/columns.md`` from the schemas in ``data_schemas/``. A
-test fails when the pages are out of date. Only the standard library is used, so any Python runs this file.
+``make reference`` writes ``docs/scenario-keys.md`` and ``docs/columns.md`` from the schemas in ``data_schemas/``, and
+``docs/modules.md`` from the docstrings of modules. A test fails when the pages are out of date. Only the standard
+library is used, so any Python runs this file.
 """
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 from pathlib import Path
@@ -14,6 +16,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 SCHEMAS = ROOT / "data_schemas"
 DOCS = ROOT / "docs"
+PACKAGE = ROOT / "pipeline" / "egvs"
 
 COLUMNS_HEAD = """\
 # Every column of every artefact
@@ -35,6 +38,12 @@ CITY_HEAD = """\
 
 The keys of a [city](city.md). Its tables, such as `[traffic]` and `[effects.<name>]`, have the same keys as in a
 scenario.
+"""
+MODULES_HEAD = """\
+# Every module
+
+`make reference` writes this page from the first sentence of each module. [Architecture](architecture.md) says what the
+packages may import.
 """
 
 TABLES: dict[str, str] = {
@@ -69,7 +78,11 @@ SAFETY_LIMIT = 1e6
 
 def pages() -> dict[Path, str]:
     """Text of each reference page, by path."""
-    return {DOCS / "columns.md": columns_page(), DOCS / "scenario-keys.md": keys_page()}
+    return {
+        DOCS / "columns.md": columns_page(),
+        DOCS / "scenario-keys.md": keys_page(),
+        DOCS / "modules.md": modules_page(),
+    }
 
 
 def columns_page() -> str:
@@ -103,6 +116,35 @@ def keys_page() -> str:
     lines = [KEYS_HEAD, *_table(scenario, scenario["$defs"], prefix="", heading="scenario.toml")]
     lines += [CITY_HEAD, *_rows(city)]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def modules_page() -> str:
+    """The packages and extensions, each with a row for every module below it."""
+    packages = sorted(path.parent for path in PACKAGE.glob("*/__init__.py") if path.parent.name != "extensions")
+    packages += sorted(path.parent for path in PACKAGE.glob("extensions/*/__init__.py"))
+    parts = [MODULES_HEAD]
+    for package in packages:
+        title = package.relative_to(PACKAGE).as_posix().replace("/", ".")
+        rows = [f"## `{title}`\n\n{_first_sentence(package / '__init__.py')}\n"]
+        rows += ["| module | what one finds there |", "|---|---|"]
+        paths = (path for path in package.rglob("*.py") if path.parent != package or path.name != "__init__.py")
+        for name, path in sorted((_module_name(path), path) for path in paths):
+            rows.append(f"| [`{name}`][] | {_first_sentence(path)} |")
+        parts.append("\n".join(rows) + "\n")
+    return "\n".join(parts)
+
+
+def _module_name(path: Path) -> str:
+    folder = path.parent if path.name == "__init__.py" else path.with_suffix("")
+    return ".".join(("egvs", *folder.relative_to(PACKAGE).parts))
+
+
+def _first_sentence(path: Path) -> str:
+    """The first paragraph of the docstring of a module, as Markdown."""
+    docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    text = " ".join(docstring.partition("\n\n")[0].split())
+    text = re.sub(r":mod:`(egvs[\w.]*)`", r"[`\1`][]", text)
+    return re.sub(r":\w+:`([^`]+)`", r"`\1`", text.replace("``", "`")).replace("|", "\\|")
 
 
 def _table(model: dict[str, Any], models: dict[str, Any], prefix: str, heading: str) -> list[str]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from egvs.core.files import add_checksum
+from egvs.artefacts.checksums import add_checksum
 from tests.conftest import BUILDING, collection, fcd, feature
 
 Change = Callable[[Path], object]

@@ -98,6 +98,16 @@ def test_command_of_missing_extension_names_it(
     assert f"'{command}' needs the extension {extension}, which is not installed." in error
 
 
+def test_comparison_of_traffic_needs_the_extension(
+    tmp_path: Path, run_egvs: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plugins, "plugin_names", lambda group: [])
+    code, _, error = run_egvs("compare", tmp_path, tmp_path, "--tpog", tmp_path / "page.html")
+    assert code == 2
+    assert "--tpog: needs the extension tracks" in error
+    assert not (tmp_path / "page.html").exists()
+
+
 def test_table_of_shipped_commands_is_complete() -> None:
     for extension in plugins.plugin_names(commands.GROUP):
         assert sorted(commands.extension_commands(extension)) == sorted(commands.SHIPPED[extension])

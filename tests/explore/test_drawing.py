@@ -68,7 +68,7 @@ def test_simplified_world_has_no_duplicate_triangles() -> None:
 
 
 def test_region_has_twelve_edges() -> None:
-    result = drawing.region_edges(FAR, drawing.drawing_origin(FAR))
+    result = drawing.roi_box_lines(FAR, drawing.drawing_origin(FAR))
     lengths = np.abs(np.diff(result, axis=1)).sum(axis=(1, 2))
     assert sorted(lengths.tolist()) == [5.0] * 4 + [20.0] * 4 + [40.0] * 4
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from egvs.artefacts.checksums import add_checksum
 from egvs.core import files
-from egvs.core.files import add_checksum
 from egvs.core.grid import Roi
 from egvs.formats.georeference import Georeference, WorldFrame
 from egvs.world import geolocation

@@ -13,7 +13,7 @@ from html.parser import HTMLParser
 import numpy as np
 
 from egvs.artefacts import parquet
-from egvs.core.files import add_checksum
+from egvs.artefacts.checksums import add_checksum
 from egvs.drawing.basemap import Roads
 from egvs.drawing.maps import Backdrop
 from egvs.report import page

@@ -9,9 +9,9 @@ import shutil
 import numpy as np
 import pytest
 
+from egvs.artefacts.checksums import add_checksum
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_tpog
-from egvs.core.files import add_checksum
 from egvs.drawing.run_figures import Figures
 from egvs.report import page
 from egvs.report.page import PageContents

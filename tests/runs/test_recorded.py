@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 import egvs
+from egvs.artefacts.checksums import add_checksum
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.core.files import add_checksum
 from egvs.runs import run
 from egvs.runs.run_context import open_folder
 from egvs.stages import scene_inputs

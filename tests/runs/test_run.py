@@ -15,10 +15,10 @@ import pytest
 
 import egvs
 from egvs.artefacts import parquet
+from egvs.artefacts.checksums import add_checksum
 from egvs.artefacts.run_folder import STAGE_NAMES
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
-from egvs.core.files import add_checksum
 from egvs.results.ranking import RankedSite
 from egvs.runs import run, stage_registry, verification
 from egvs.runs.run import lock_run_folder

@@ -12,12 +12,13 @@ import pytest
 from rich.console import Console
 
 import egvs
+from egvs.artefacts import checksums
+from egvs.artefacts.checksums import add_checksum
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.cli import run_list_table
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
-from egvs.core.files import add_checksum
 from egvs.runs import locks, run_list, run_sources
 from egvs.runs.run import lock_run_folder
 from egvs.runs.run_sources import SettingsSource
@@ -440,7 +441,7 @@ def test_record_with_overrides_of_another_type_is_rejected(here: Path) -> None:
     egvs.run(egvs.load(here))
     path = RunFolder(Path("runs/mini")).run_record
     values = json.loads(path.read_text()) | {"overrides": ["score.gamma"]}
-    del values[files.CHECKSUM_KEY]
+    del values[checksums.CHECKSUM_KEY]
     path.write_text(json.dumps(add_checksum(values)))
     with pytest.raises(InputError, match="'overrides' is"):
         RunRecord.read(Path("runs/mini"))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import egvs
+from egvs.artefacts import checksums
 from egvs.core import files
 from egvs.core.errors import RunError
 from egvs.core.resource_usage import measure_usage
@@ -31,7 +32,7 @@ def test_repeat_with_other_bytes_is_an_error(mini: Path, tmp_path: Path) -> None
     keys = runner.run_stages(original)
     cost = tmp_path / "accuracy" / "times" / f"tpog-{keys['tpog'][:16]}.json"
     times = json.loads(cost.read_text().replace('"tpog.parquet": "', '"tpog.parquet": "0'))
-    cost.write_text(files.to_json_text(files.add_checksum(times)))
+    cost.write_text(files.to_json_text(checksums.add_checksum(times)))
     with pytest.raises(RunError, match="wrote bytes that differ"):
         runner.time_again("tpog", original, keys["tpog"])
 

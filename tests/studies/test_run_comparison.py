@@ -17,11 +17,11 @@ from rich.console import Console
 from scipy.stats import kendalltau
 
 import egvs
+from egvs.artefacts.checksums import add_checksum
 from egvs.artefacts.run_record import RunRecord
 from egvs.cli import console as cli_console
 from egvs.cli import study_tables
 from egvs.core.errors import InputError
-from egvs.core.files import add_checksum
 from egvs.report.sensor_text import SENSOR_EVIDENCE
 from egvs.results.ranking import RankedSite, Ranking, ScoreValue, share_of_limit
 from egvs.scenario.score_config import CostsConfig

@@ -1,4 +1,7 @@
-"""Checksums of the files of studies, in the format of ``sha256sum --check``.
+"""Checksums: of JSON records, as one of their keys, and of the files of studies, as ``sha256sum --check`` reads them.
+
+Records of this program contain their own hash, so that any damage is noticed. It is not a signature: anyone who can
+write the file can recompute it.
 
 Studies (accuracy, validation, placement) can be made where there is no run; they leave lists of checksums instead of an
 entry in ``run.json``.
@@ -6,9 +9,11 @@ entry in ``run.json``.
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from egvs.core import files
 from egvs.core.errors import InputError
@@ -46,3 +51,21 @@ def changed_files(path: Path, hint: str) -> list[str]:
         if file.is_file() and files.hash_file(file) != entry[1]:
             changed.append(file.name)
     return changed
+
+
+CHECKSUM_KEY = "own_sha256"
+"""Key of the hash of all other keys of a record."""
+
+
+def add_checksum(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record with its checksum as the last key."""
+    record = {key: part for key, part in value.items() if key != CHECKSUM_KEY}
+    return {**record, CHECKSUM_KEY: files.hash_json(json.loads(files.to_json_text(record)))}
+
+
+def has_valid_checksum(value: Any) -> bool:
+    """Return whether a value parsed from JSON is a record with the right checksum."""
+    if not isinstance(value, dict):
+        return False
+    record = {key: part for key, part in value.items() if key != CHECKSUM_KEY}
+    return value.get(CHECKSUM_KEY) == files.hash_json(record)

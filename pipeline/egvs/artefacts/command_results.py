@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from egvs.artefacts.checksums import add_checksum, has_valid_checksum
 from egvs.artefacts.run_record import StageRecord, have_inputs
 from egvs.core import files, reading
 from egvs.core.errors import InputError
-from egvs.core.files import add_checksum, has_valid_checksum
 
 _HINT = "Remove it and repeat the command that wrote it."
 

@@ -150,11 +150,7 @@ def extension_files() -> tuple[RunFile, ...]:
     files: list[RunFile] = []
     names = {file.name for file in RunFolder.core_files()}
     for extension in plugins.plugin_names(GROUP):
-        declared = plugins.load_plugin(GROUP, extension)
-        if not (isinstance(declared, tuple) and all(isinstance(file, RunFile) for file in declared)):
-            problem = f"expected a tuple of {RunFile.__module__}.{RunFile.__name__}, got {declared!r}"
-            raise plugins.plugin_error(GROUP, extension, problem)
-        for file in declared:
+        for file in plugins.load_rows(GROUP, extension, RunFile):
             if file.name in names:
                 raise plugins.plugin_error(GROUP, extension, f"{file.name} is a file of another part of the program")
             names.add(file.name)

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from egvs.artefacts.checksums import CHECKSUM_KEY, add_checksum, has_valid_checksum
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.core import files, reading
 from egvs.core.errors import InputError
-from egvs.core.files import CHECKSUM_KEY, add_checksum, has_valid_checksum
 from egvs.core.resource_usage import ResourceUsage
 from egvs.core.wording import list_first
 

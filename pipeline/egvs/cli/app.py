@@ -1,8 +1,8 @@
 """The command line ``egvs``: each verb parses its options, calls the program, and prints the result.
 
-Verbs with several tables are in modules of their own (``place``, ``compare``); those of extensions are found through
-entry points (:mod:`egvs.cli.commands`). Heavy modules are imported by
-the verb that needs them, so that ``egvs --help`` is quick.
+Verbs with several tables are in modules of their own, which are imported when they are called
+(:mod:`egvs.cli.commands`); those of extensions are found through entry points. Heavy modules are imported by the verb
+that needs them, so that ``egvs --help`` is quick.
 """
 
 from __future__ import annotations
@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import compare, environment, exit, place, sources, what_if
+from egvs.cli import environment, exit
 from egvs.cli import options as cli_options
-from egvs.cli.commands import PANELS, ExtensibleGroup
+from egvs.cli.commands import ExtensibleGroup
 from egvs.cli.options import (
     DEFAULT_POLES,
     Audit,
@@ -238,7 +237,9 @@ def score(
 @app.command()
 def report(scenario: SettingsPath, out: Out = None, set_: Set = None) -> None:
     """Write the report of a run, report.html."""
-    _run_stage("report", scenario, out, set_, open_source=sources.open_source)
+    from egvs.cli.sources import open_source
+
+    _run_stage("report", scenario, out, set_, open_source=open_source)
 
 
 def _run_stage(
@@ -263,7 +264,7 @@ def _run_stage(
         record = run.run_one(
             stage, loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **stage_options
         )
-    run_tables.print_stage(folder, stage, record, top=top)
+    run_tables.print_stage_files(folder, stage, record, top=top)
 
 
 @app.command()
@@ -292,10 +293,6 @@ def verify(
 # ---- studies
 
 
-app.command()(compare.compare)
-app.command("what-if")(what_if.what_if)
-
-
 @app.command()
 def accuracy(
     scenario: SettingsPath,
@@ -317,6 +314,7 @@ def accuracy(
     ] = None,
 ) -> None:
     """Price the choice of a pole: seconds and expected loss of many settings, and the cheapest one that suffices."""
+    from egvs.cli import sources
     from egvs.cli.console import ProgressDisplay
 
     budget_s = cli_options.duration_s(budget)
@@ -349,7 +347,7 @@ def effects(
     jobs: Jobs = None,
 ) -> None:
     """List the effects; with a scenario, show which are enabled or recommended, why, and what they change."""
-    from egvs.cli import run_tables
+    from egvs.cli import run_tables, sources
     from egvs.cli.console import ProgressDisplay
     from egvs.studies import effect_study
 
@@ -393,9 +391,6 @@ def _unmeasured_effects(statuses: Sequence[EffectStatus], costs: Collection[str]
     return ", ".join(name for name in active if name not in costs)
 
 
-app.command()(place.place)
-
-
 # ---- the explorer
 
 
@@ -424,7 +419,7 @@ def explore(
     from egvs.core import files, plugins
 
     plugins.require_libraries("egvs explore", "explore", "viser", "PIL")
-    from egvs.cli import answer
+    from egvs.cli import answer, sources
     from egvs.explore.page import Page, check_port_free
     from egvs.explore.settings import open_session
 
@@ -458,7 +453,7 @@ def _write_page_file(
     folder: Path, set_: list[str] | None, out: Path | None, jobs: int | None, to: Path, *, has_page_options: bool
 ) -> None:
     """Write the 3D view of a run as one HTML file, and print what is in it."""
-    from egvs.cli import answer
+    from egvs.cli import answer, sources
     from egvs.cli.console import ProgressDisplay
     from egvs.explore.page_file import check_page_file, write_page_file
     from egvs.explore.settings import open_session
@@ -813,23 +808,3 @@ def store(
     elif max_size is not None:
         bound_bytes = cli_options.size_bytes(max_size)
     run_tables.print_removed(cache, cache.prune(bound_bytes))
-
-
-# ---- egvs --help
-
-
-def _group_commands() -> None:
-    """Show the commands in their panels, in the order of :data:`egvs.cli.commands.PANELS`."""
-    panel_of = {name: panel for panel, names in PANELS.items() for name in names}
-    order = list(panel_of)
-
-    def command_name(info: CommandInfo) -> str:
-        assert info.callback is not None
-        return info.name or info.callback.__name__
-
-    app.registered_commands.sort(key=lambda info: order.index(command_name(info)))
-    for command in app.registered_commands:
-        command.rich_help_panel = panel_of[command_name(command)]
-
-
-_group_commands()

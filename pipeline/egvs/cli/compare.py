@@ -9,13 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from egvs.cli.options import Top, command_words
-from egvs.core import files
+from egvs.core import files, plugins
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
     from egvs.cli.console import ProgressDisplay
     from egvs.studies.assumed_heights import HeightRun
     from egvs.studies.sensor_runs import SensorRun
+
+GROUP = "egvs.traffic_comparisons"
+"""Entry points of what ``--tpog`` calls: a function of the recorded and the simulated run, the page, and the number of
+lanes that are printed (None for all)."""
 
 _OPTION = "--sensors"
 _HEIGHTS_OPTION = "--assumed-heights"
@@ -112,9 +116,8 @@ def compare(
 
 
 def _compare_tpogs(runs: Sequence[Path], page: Path, top: int | None) -> None:
-    """Compare the traffic of two runs, print the numbers, and write a page."""
-    from egvs.cli import tpog_table
-    from egvs.cli.console import ProgressDisplay
+    """Compare the traffic of two runs by an extension, which prints the numbers and writes a page."""
+    from egvs.traffic import traffic_sources
 
     if len(runs) != 2:
         problem = f"expected two runs, the recorded and the simulated one, got {len(runs)}"
@@ -122,12 +125,11 @@ def _compare_tpogs(runs: Sequence[Path], page: Path, top: int | None) -> None:
     if page.suffix != ".html":
         raise InputError(_TPOG_OPTION, f"expected a file PAGE.html to write, got {page}", "Use --tpog traffic.html.")
     files.check_writable(page)
-    with ProgressDisplay("compare") as screen:
-        from egvs.studies import tpog_comparison, tpog_page
-
-        comparison = tpog_comparison.compare_tpogs(runs[0], runs[1], screen.progress)
-        tpog_page.write_page(page, comparison)
-    tpog_table.print_tpog_comparison(comparison, page, top)
+    names = plugins.plugin_names(GROUP)
+    if not names:
+        raise traffic_sources.missing_extension(_TPOG_OPTION)
+    compare_traffic = plugins.load_plugin(GROUP, names[0])
+    compare_traffic(runs[0], runs[1], page, top)
 
 
 def _compare_heights(paths: Sequence[Path], overrides: Sequence[str]) -> None:

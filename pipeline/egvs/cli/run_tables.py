@@ -1,8 +1,4 @@
-"""What a command prints about runs and about what is available.
-
-Runs: ranking, files and costs of a run, findings of a check, results of a verification, a new scenario. What is
-available: sensors, effects and what they change, and the store of cached results.
-"""
+"""Tables of many commands: ranking, files and costs of a run, findings of a check, sensors, effects, the store."""
 
 from __future__ import annotations
 
@@ -66,7 +62,7 @@ def _artefact_paths(folder: Path, record: RunRecord, stage: str) -> list[str]:
     return [str(folder / name) for name in record.stages[stage].artefacts]
 
 
-def print_stage(folder: Path, stage: str, record: RunRecord, *, top: int | None = None) -> None:
+def print_stage_files(folder: Path, stage: str, record: RunRecord, *, top: int | None = None) -> None:
     """Print the files that one stage wrote; after the score stage, the ranking too."""
     out = console(_RESULT_FILE_WIDTH)
     if stage == "score":

@@ -100,7 +100,7 @@ def _describe_differences(differences: dict[str, tuple[Any, Any]]) -> str:
 
 def format_setting(key: str, value: Any) -> str:
     """Return a setting as text: an effect without other parameters as "on" or "off", an empty value as "none"."""
-    from egvs.runs.run_names import effect_state
+    from egvs.scenario.settings import effect_state
 
     if state := effect_state(key, value):
         return state

@@ -1,4 +1,4 @@
-"""How ``egvs effects --ablation`` ends."""
+"""The last sentence of ``egvs effects --ablation``: whether the best site stays first under the effects."""
 
 from __future__ import annotations
 

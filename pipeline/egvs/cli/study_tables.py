@@ -1,4 +1,4 @@
-"""What ``egvs compare`` prints.
+"""What ``egvs compare`` prints: runs, poles, sensors, assumed heights, and settings side by side.
 
 Runs in columns and poles or sites in rows, the agreement of their rankings, the best mount of each sensor and what one
 more percentage point costs, and the differences of settings.
@@ -28,7 +28,7 @@ from egvs.results.sensors import (
     difference_unit,
     format_difference,
 )
-from egvs.runs.run_names import effect_state
+from egvs.scenario.settings import effect_state
 
 if TYPE_CHECKING:
     from egvs.studies.assumed_heights import HeightRuns, HeightSensitivity, RankedAgain

@@ -1,4 +1,4 @@
-"""Values of summaries as text."""
+"""Values of settings, and of the summaries of stages, as text."""
 
 from __future__ import annotations
 

@@ -1,10 +1,7 @@
-"""Atomic writing, temporary folders, hashes, and JSON records with a checksum.
+"""Atomic writing, temporary folders, hashes, and JSON text.
 
 A file is first written to ``.<name>.partial``, then renamed, so that a killed run leaves no half-written artefact.
 Temporary folders are locked while they are in use, so that the next program removes those of a killed one.
-
-Records of this program contain their own hash, so that any damage is noticed. The checksum is not a signature:
-anyone who can write the file can recompute it.
 """
 
 from __future__ import annotations
@@ -276,21 +273,3 @@ def _replace_non_finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_replace_non_finite(part) for part in value]
     return value
-
-
-CHECKSUM_KEY = "own_sha256"
-"""Key of the hash of all other keys of a record."""
-
-
-def add_checksum(value: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record with its checksum as the last key."""
-    record = {key: part for key, part in value.items() if key != CHECKSUM_KEY}
-    return {**record, CHECKSUM_KEY: hash_json(json.loads(to_json_text(record)))}
-
-
-def has_valid_checksum(value: Any) -> bool:
-    """Return whether a value parsed from JSON is a record with the right checksum."""
-    if not isinstance(value, dict):
-        return False
-    record = {key: part for key, part in value.items() if key != CHECKSUM_KEY}
-    return value.get(CHECKSUM_KEY) == hash_json(record)

@@ -1,4 +1,4 @@
-"""Numbers in text files."""
+"""Parse numbers in texts: decimal numbers in ASCII, or NaN."""
 
 from __future__ import annotations
 

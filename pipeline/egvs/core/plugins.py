@@ -14,10 +14,12 @@ from functools import cache
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
 from operator import attrgetter
-from typing import Any
+from typing import Any, TypeVar
 
 from egvs.core.errors import InputError, MissingBackendError, MissingExtraError
 from egvs.core.wording import by_number
+
+T = TypeVar("T")
 
 PACKAGE_NAME = "egvs"
 """The package of this program."""
@@ -104,6 +106,40 @@ def load_plugin(group: str, name: str) -> Any:
         raise plugin_error(group, name, str(error)) from error
     except (Exception, SystemExit) as error:  # a foreign module may do anything when it is imported
         raise plugin_error(group, name, f"its import raised {error!r}") from error
+
+
+def load_plugins(group: str, kind: type[T], expected: str) -> tuple[T, ...]:
+    """Return the objects of all entry points of a group, in the order of their names.
+
+    Parameters
+    ----------
+    group
+        The group.
+    kind
+        What each must be an instance of: a class, or a protocol that can be checked at run time.
+    expected
+        What an object of this group is, for the message.
+
+    Raises
+    ------
+    MissingBackendError
+        When one cannot be loaded, or is none of this kind.
+    """
+    loaded = []
+    for name in plugin_names(group):
+        plugin = load_plugin(group, name)
+        if not isinstance(plugin, kind):
+            raise plugin_error(group, name, f"expected {expected}")
+        loaded.append(plugin)
+    return tuple(loaded)
+
+
+def load_rows(group: str, name: str, kind: type[T]) -> tuple[T, ...]:
+    """Return the object of an entry point that is a tuple of rows of one class; MissingBackendError if it is none."""
+    rows = load_plugin(group, name)
+    if not isinstance(rows, tuple) or not all(isinstance(row, kind) for row in rows):
+        raise plugin_error(group, name, f"expected a tuple of {kind.__module__}.{kind.__name__}, got {rows!r}")
+    return rows
 
 
 def check_plugin(group: str, name: str, plugin: object, required: tuple[str, ...], expected: str) -> None:

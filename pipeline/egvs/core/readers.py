@@ -201,10 +201,7 @@ def _table() -> dict[Reader, str]:
     own: dict[Reader, str] = {}
     others: dict[Reader, str] = {}
     for name in plugins.plugin_names(GROUP):
-        readers = plugins.load_plugin(GROUP, name)
-        if not isinstance(readers, tuple) or not all(isinstance(reader, Reader) for reader in readers):
-            problem = f"expected a tuple of {Reader.__module__}.{Reader.__name__}, got {readers!r}"
-            raise plugins.plugin_error(GROUP, name, problem)
+        readers = plugins.load_rows(GROUP, name, Reader)
         is_own = plugins.plugin_package(GROUP, name) == plugins.PACKAGE_NAME
         (own if is_own else others).update(dict.fromkeys(readers, name))
     return dict(sorted(own.items(), key=_is_without_content)) | dict(sorted(others.items(), key=_is_without_content))

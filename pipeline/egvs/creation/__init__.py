@@ -1,1 +1,1 @@
-"""Scenarios made from OpenStreetMap."""
+"""New scenarios, made from maps and recordings."""

@@ -41,7 +41,6 @@ from egvs.creation import (
     new_traffic,
     scenario_files,
     static_objects,
-    street_counts,
 )
 from egvs.creation.alignment import PointPair, check_used, make_alignment
 from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, NoTraffic
@@ -74,10 +73,9 @@ from egvs.creation.scenario_files import (
     reachable_area,
 )
 from egvs.creation.static_objects import MapSummary, ReadMap, StaticObjects, SurfaceModel
-from egvs.creation.terrain import bridge_decks, ground_heights, ground_reference
+from egvs.creation.terrain import ground_heights, ground_reference
 from egvs.creation.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.creation.terrain.relief import Relief, ground_surface
-from egvs.formats import ply
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.signal_config import ASSUMED_PLANS
@@ -492,7 +490,9 @@ def _collect_objects(draft: _Draft) -> None:
     )  # fmt: skip
     _check_zero_height(draft.objects.zero_height_m, draft.files)
     if draft.files.terrain and terrain is not None and zero_height_m is not None:
-        decks = bridge_decks.bridge_decks(draft.roads.network, terrain, zero_height_m)
+        from egvs.creation.terrain.bridge_decks import bridge_decks
+
+        decks = bridge_decks(draft.roads.network, terrain, zero_height_m)
         draft.objects = replace(draft.objects, meshes=(*draft.objects.meshes, *decks))
 
 
@@ -553,6 +553,8 @@ def _choose_vehicles(draft: _Draft) -> ScenarioTraffic:
     if draft.plan.is_finished:
         return NoTraffic()  # none is simulated; the recorded ones are read back from the finished scenario
     if options.counts is not None:
+        from egvs.creation import street_counts
+
         return street_counts.read_junction_counts(options.counts, streets, draft.junction)
     try:
         return assumed_traffic.assume_traffic(draft.plan.network, streets, draft.junction, options.traffic)
@@ -571,6 +573,8 @@ def _write_scenario(draft: _Draft) -> NewScenario:
     meshes = static_objects.mesh_files(solid_meshes)
     terrain_files = {}
     if draft.terrain_m is not None:
+        from egvs.formats import ply
+
         terrain_files[TERRAIN_FILE] = partial(ply.write, points_m=draft.terrain_m)
     statics = scenario_files.statics_table(list(meshes), *terrain_files)
     contents: dict[str, FileContent] = {

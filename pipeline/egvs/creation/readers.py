@@ -1,4 +1,4 @@
-"""Formats of road maps that this package reads; see :mod:`egvs.creation.map_readers`."""
+"""The readers of road maps that the core has: OpenStreetMap and SUMO; see :mod:`egvs.creation.map_readers`."""
 
 from __future__ import annotations
 

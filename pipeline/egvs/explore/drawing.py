@@ -123,7 +123,7 @@ def _simplify(mesh: Mesh, cell_m: float) -> Mesh:
     return Mesh(means.astype(np.float32), faces[np.sort(first)].astype(np.int32))
 
 
-def region_edges(roi: Roi, zero_m: Vec3) -> Points:
+def roi_box_lines(roi: Roi, zero_m: Vec3) -> Points:
     """Return the 12 edges of the region of interest, (12, 2, 3)."""
     unit = np.array(list(product((0.0, 1.0), repeat=3)))
     corners = np.asarray(roi.origin_m) + unit * roi.size_m - zero_m
@@ -274,7 +274,7 @@ class SceneMeshes:
             meshes["lanes"] = lane_mesh(roads.carriageway, zero_m)
         if roads.network is not None:
             meshes["markings"] = marking_mesh(roads.network, zero_m)
-        scene.add_line_segments("/roi", region_edges(session.scene.roi, zero_m), _ROI_COLOUR, thickness=0.15)
+        scene.add_line_segments("/roi", roi_box_lines(session.scene.roi, zero_m), _ROI_COLOUR, thickness=0.15)
         handles = {}
         for kind, mesh in meshes.items():
             if not len(mesh.faces):

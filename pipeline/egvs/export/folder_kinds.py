@@ -59,14 +59,8 @@ def folder_kinds() -> tuple[FolderKind, ...]:
     MissingBackendError
         When an entry point cannot be loaded, or is no :class:`FolderKind`.
     """
-    kinds = []
-    for name in plugins.plugin_names(GROUP):
-        kind = plugins.load_plugin(GROUP, name)
-        if not isinstance(kind, FolderKind):
-            problem = "expected an object with name, marker, state, title, reference_run, layers and part_hint"
-            raise plugins.plugin_error(GROUP, name, problem)
-        kinds.append(kind)
-    return tuple(kinds)
+    expected = "an object with name, marker, state, title, reference_run, layers and part_hint"
+    return plugins.load_plugins(GROUP, FolderKind, expected)  # type: ignore[type-abstract]
 
 
 def find_kind(folder: Path) -> FolderKind | None:

@@ -1,1 +1,1 @@
-"""Parts of the program that can be taken away; the core finds them through entry points."""
+"""Extensions: parts of the program that can be taken away; the core finds them through entry points."""

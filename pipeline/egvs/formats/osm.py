@@ -1,8 +1,8 @@
 """Read OpenStreetMap files: XML (``.osm``, may be gzipped) and PBF (``.osm.pbf``), recognised by their content.
 
 Steps of :func:`read_osm`: check values that osmium does not check (XML only); read the objects with osmium; keep the
-positions of nodes, tagged nodes, ways, relations, and the extract's bounds. :func:`write_streets` writes the streets
-alone, for netconvert, so that SUMO reads only what was checked here. :func:`write_xml` converts a PBF file to XML.
+positions of nodes, tagged nodes, ways, relations, and the extract's bounds. :func:`write_xml` converts a PBF file to
+XML.
 
 Coordinates are latitude and longitude in degrees (WGS 84), in multiples of 1e-7 degree (1 cm), as in OpenStreetMap.
 Objects are sorted by identifier, so that their order in the file does not matter. The meaning of tags:
@@ -184,27 +184,6 @@ def write_xml(path: Path, xml: Path) -> None:
             for o in objects:
                 if isinstance(o, osmium.osm.Changeset) or o.visible:
                     writer.add(o)
-
-
-def write_streets(extract: OsmExtract, xml: Path) -> None:
-    """Write the streets (ways with ``highway``), their nodes, and the turn restrictions as an OpenStreetMap file."""
-    import osmium
-    from osmium.osm import mutable
-
-    streets = [way for way in extract.ways.values() if "highway" in way.tags]
-    with osmium.SimpleWriter(osmium.io.File(xml, "osm")) as writer:
-        for node in sorted({n for way in streets for n in way.nodes if n in extract.nodes}):
-            lat_deg, lon_deg = extract.nodes[node]
-            tags = sorted(extract.node_tags.get(node, {}).items())
-            writer.add_node(mutable.Node(id=node, location=(lon_deg, lat_deg), tags=tags))
-        for way in streets:
-            nodes = [n for n in way.nodes if n in extract.nodes]
-            writer.add_way(mutable.Way(id=way.id, nodes=nodes, tags=sorted(way.tags.items())))
-        for relation in extract.relations:
-            if relation.tags.get("type") == "restriction":
-                members = [(member.type[0], member.id, member.role) for member in relation.members]
-                tags = sorted(relation.tags.items())
-                writer.add_relation(mutable.Relation(id=relation.id, members=members, tags=tags))
 
 
 def parse_length_m(text: str) -> float | None:

@@ -18,7 +18,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from datetime import date, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
@@ -27,8 +27,9 @@ from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE
-from egvs.formats import parquet_process
-from egvs.formats.gdal_layers import FEATURE_BYTES, read_layer
+
+if TYPE_CHECKING:
+    from egvs.formats import parquet_process
 
 GIS_FORMATS = {
     ".gpkg": "GeoPackage", ".shp": "Shapefile", ".kml": "KML", ".parquet": "GeoParquet", ".geoparquet": "GeoParquet",
@@ -94,6 +95,9 @@ def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str
     plugins.require_libraries(f"{path.name}: reading {kind}", "gis", "pyogrio")
     if kind == "Shapefile":
         _check_shapefile_complete(path)
+
+    from egvs.formats.gdal_layers import read_layer
+
     return read_layer(path, kind, geometry, companion_files(path))
 
 
@@ -127,6 +131,8 @@ def _check_shapefile_complete(path: Path) -> None:
 
 def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
     """Return the table of a GeoParquet file, the name of its geometry column, and its reference system."""
+    from egvs.formats import parquet_process
+
     doing = "the file cannot be read as GeoParquet"
     with parquet_process.open_parquet(path, doing) as (header, batches):
         name, crs = _geometry_column(path, header, doing)
@@ -154,6 +160,9 @@ def _geometry_column(path: Path, header: parquet_process.ParquetHeader, doing: s
 
 def _bounded_table(path: Path, rows: Iterator[pa.RecordBatch]) -> pa.Table:
     """Return the rows of a file that is small enough to be held as features."""
+    from egvs.formats import parquet_process
+    from egvs.formats.gdal_layers import FEATURE_BYTES
+
     batches = []
     size = 0
     for batch in rows:

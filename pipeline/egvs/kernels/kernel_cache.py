@@ -93,7 +93,8 @@ def use_cache_folder(kernels: Path) -> bool:
     Parameters
     ----------
     kernels
-        The folder of the package that holds all kernels.
+        The folder of the package that holds the kernels of the core; those of extensions are in their folders
+        ``kernels``.
 
     Returns
     -------
@@ -101,8 +102,9 @@ def use_cache_folder(kernels: Path) -> bool:
         False where no folder can be written; kernels are then not cached.
     """
     digest = hashlib.sha256(f"numba {numba.__version__} python {sys.version}".encode())
-    for path in sorted(kernels.rglob("*.py")):
-        digest.update(path.relative_to(kernels).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    package = kernels.parent
+    for path in sorted([*kernels.rglob("*.py"), *package.glob("extensions/*/kernels/*.py")]):
+        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
     folder = find_cache_folder(kernels, "numba", digest.hexdigest(), os.environ.get("NUMBA_CACHE_DIR"))
     if folder is None:
         return False

@@ -254,7 +254,7 @@ def build_problem(context: StageContext, on_progress: Callable[[int], None]) -> 
     scenario = context.scenario
     sites = context.scene.sites
     rules = rules_from_config(scenario, sites)
-    tpogs = _read_tpogs(context)
+    tpogs = read_tpogs(context)
 
     objective = make_objective(context, tpogs)
     views: tuple[View, ...] = (objective.view,)
@@ -297,34 +297,14 @@ def build_problem(context: StageContext, on_progress: Callable[[int], None]) -> 
     return PlacementProblem(placement_problem, sites, score, views, visibilities, joint_of_all)
 
 
-def _read_tpogs(context: StageContext) -> dict[str, Tpog]:
-    """Occupancy of all traffic, as "", then of each named period."""
+def read_tpogs(context: StageContext) -> dict[str, Tpog]:
+    """Return the occupancy of all traffic, as "", then of each named period."""
     path = context.folder.tpog
     names = [period.name for period in read_periods(path) if period.name]
     tpogs = {"": read_tpog(path)}
     for name in names:
         tpogs[name] = read_tpog(path, name)
     return tpogs
-
-
-def joint_scores(context: StageContext, plans: Sequence[Sequence[str]]) -> list[float]:
-    """Return the joint score of each of some sets of candidates; other candidates are not scanned.
-
-    Parameters
-    ----------
-    context
-        The run; the stages up to the TPOG and the scans are up to date.
-    plans
-        Names of the candidates of each set.
-    """
-    names = set().union(*plans)
-    used = [site.name for site in context.scene.sites if site.name in names]
-    if not used:
-        return [0.0] * len(plans)
-    objective = make_objective(context, _read_tpogs(context))
-    (visibility,) = visibility_matrices(context, (objective.view,), lambda _: None, only=used)
-    term = objective.terms(visibility)[""]
-    return [problem.CoverageState([term], [used.index(name) for name in plan]).value(term) for plan in plans]
 
 
 def visibility_matrices(

@@ -45,7 +45,7 @@ def compare_approaches(scenario: Scenario, trajectories: Path, network: Path | N
     Parameters
     ----------
     scenario
-        The result is empty unless it has ``traffic.observed``.
+        A scenario with ``traffic.observed``.
     trajectories
         The artefact.
     network
@@ -56,8 +56,6 @@ def compare_approaches(scenario: Scenario, trajectories: Path, network: Path | N
     InputError
         When the file of observations is not valid, or there is no network.
     """
-    if scenario.traffic.observed is None:
-        return ()
     if network is None:
         problem = "the run folder has no network"
         raise InputError(f"{scenario.file}: {observed.KEY}", problem, "Use traffic that is simulated on a network.")

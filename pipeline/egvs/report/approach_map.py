@@ -6,7 +6,6 @@ hour that turn left, drive straight on, turn right or make a U-turn.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from egvs.core import polylines
 from egvs.drawing import maps
 from egvs.drawing.basemap import roads_within
 from egvs.drawing.svg_figures import Box, MapFrame, text_width
+from egvs.report.sections import busiest_counts
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_queues import approach_paths
@@ -51,13 +51,6 @@ class ApproachLabel:
         return self.name, *turns
 
 
-def busiest_counts(scenario: Scenario) -> tuple[str, tuple[CountConfig, ...]]:
-    """Return the period with most vehicles per hour (empty without periods) and its counts."""
-    periods = {name: period.traffic.counts for name, period in scenario.by_period().items()}
-    name = max(periods, key=lambda period: math.fsum(count.per_hour for count in periods[period]))
-    return name, periods[name]
-
-
 def approach_labels(counts: Sequence[CountConfig], network: Path, center_m: tuple[float, float]) -> list[ApproachLabel]:
     """Return the approaches of counts, in the order of the compass."""
     roads = read_net_xml(network)
@@ -76,11 +69,9 @@ def approach_labels(counts: Sequence[CountConfig], network: Path, center_m: tupl
     return labels
 
 
-def draw_approach_map(scenario: Scenario, network: Path | None) -> str:
-    """Return the map as SVG; empty where a scenario counts nothing, or the run folder has no network."""
+def draw_approach_map(scenario: Scenario, network: Path) -> str:
+    """Return the map of the busiest period of a scenario with counts, as SVG."""
     period, counts = busiest_counts(scenario)
-    if network is None or not counts:
-        return ""
     (x_m, y_m, _), (width_m, height_m, _) = scenario.roi.center_m, scenario.roi.size_m
     half_m = max(width_m, height_m) / 2 + _MARGIN_M
     labels = approach_labels(counts, network, (x_m, y_m))

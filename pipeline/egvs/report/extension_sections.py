@@ -100,14 +100,8 @@ def report_sections() -> tuple[ReportSection, ...]:
     MissingBackendError
         When an entry point cannot be loaded, or is no :class:`ReportSection`.
     """
-    sections = []
-    for name in plugins.plugin_names(GROUP):
-        section = plugins.load_plugin(GROUP, name)
-        if not isinstance(section, ReportSection):
-            problem = "expected an object with name, files, template, read and warnings, see ReportSection"
-            raise plugins.plugin_error(GROUP, name, problem)
-        sections.append(section)
-    return tuple(sections)
+    expected = "an object with name, files, template, read and warnings, see ReportSection"
+    return plugins.load_plugins(GROUP, ReportSection, expected)  # type: ignore[type-abstract]
 
 
 def section_modules() -> tuple[str, ...]:

@@ -26,8 +26,6 @@ from egvs.drawing import maps, pages
 from egvs.drawing import run_figures as figures
 from egvs.drawing.basemap import network_file
 from egvs.drawing.run_figures import Figures
-from egvs.report.approach_fits import ApproachFit, compare_approaches
-from egvs.report.approach_map import busiest_counts, draw_approach_map
 from egvs.report.extension_sections import (
     SectionContents,
     read_sections,
@@ -42,30 +40,30 @@ from egvs.report.sections import (
     NAMED_POLES,
     assumes_flows,
     assumptions,
+    busiest_counts,
     describe_counts,
     describe_poles_on_road,
     egvs_setting,
-    plan_values,
     ranking_disagreement,
     study_values,
 )
 from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, range_note
-from egvs.report.signal_diagram import signal_diagrams
-from egvs.report.what_if_section import WhatIfSection
-from egvs.report.zone_section import ZoneSection
 from egvs.results import labels as formatting
-from egvs.results.command_entries import Entries, current_entries, what_if_digest
 from egvs.results.map_credits import read_map_credits
-from egvs.results.plans import SensorPlan
 from egvs.results.ranking import RankedSite, Ranking, share_of_limit
 from egvs.results.sensors import SensorComparison
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_dependencies import scan_dependencies
-from egvs.traffic import observed
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+
+    from egvs.report.approach_fits import ApproachFit
+    from egvs.report.what_if_section import WhatIfSection
+    from egvs.report.zone_section import ZoneSection
+    from egvs.results.command_entries import Entries
+    from egvs.results.plans import SensorPlan
 
 STAGES = ("check", "traffic", "statics", "tpog", "scan", "score")
 """Stages whose costs and artefacts the page shows, in its order."""
@@ -111,7 +109,7 @@ class PageContents:
     study, by_period, plan
         Results of other commands and of periods; None if those commands have not run.
     what_if
-        Results of what-ifs.
+        Results of what-ifs; None without any.
     zones, points
         Road users found in zones, and maps of points on target; None where the scenario has no zones or no lanes.
     movements
@@ -133,7 +131,7 @@ class PageContents:
     by_period: PeriodRanking | None = None
     plan: Mapping[str, Any] | None = None
     movements: Mapping[str, str] = field(default_factory=dict)
-    what_if: WhatIfSection = field(default_factory=WhatIfSection)
+    what_if: WhatIfSection | None = None
     zones: ZoneSection | None = None
     points: PointsSection | None = None
     approaches: tuple[ApproachFit, ...] = ()
@@ -169,6 +167,8 @@ def dependencies(work: StageContext) -> StageDependencies:
     names = [RunFolder.trajectories.name, RunFolder.tpog.name, RunFolder.statics.name, RunFolder.scores.name]
     settings: dict[str, Any] = {"shown": _displayed_settings(scenario), "keep": scenario.scan.keep}
     if scenario.traffic.observed is not None:
+        from egvs.traffic import observed
+
         settings["observed"] = work.inputs.digests.of(scenario.find(scenario.traffic.observed, observed.KEY))
         settings["counts"] = describe_counts(scenario, network_file(work.folder.path))
     if map_credits := read_map_credits(scenario):
@@ -234,6 +234,11 @@ def _recorded_stages(folder: Path) -> dict[str, StageRecord]:
 
 def _current_what_ifs(work: StageContext, stages: Mapping[str, StageRecord]) -> Entries:
     """The answers of ``egvs what-if`` that belong to the run."""
+    if not work.folder.what_if.is_file():
+        return {}
+
+    from egvs.results.command_entries import current_entries, what_if_digest
+
     return current_entries(work.folder.what_if, stages, lambda values: what_if_digest(work.scenario, values["tables"]))
 
 
@@ -253,13 +258,16 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
     drawn = figures.draw_figures(work, ranking, SiteListing.from_ranking(ranking).choices, tpog)
     work.progress("figures drawn", 2, 3)
 
-    plan = SensorPlan.read(work.folder)
-    if plan is not None and not plan.belongs_to(stages):
-        plan = None
+    network, backdrop, best = network_file(out), drawn.backdrop, ranking.sites[0]
+    plan = _read_plan(work.folder, stages)
     mapped = [pole.best for pole in ranking.poles[:MAPPED_POLES]]
     mounts = [] if plan is None else [sensor.mount for sensor in plan.sensors]
     moved = plan is not None and plan.refinement is not None
-    approaches = compare_approaches(work.scenario, work.folder.trajectories, network_file(out))
+    approaches: tuple[ApproachFit, ...] = ()
+    if work.scenario.traffic.observed is not None:
+        from egvs.report.approach_fits import compare_approaches
+
+        approaches = compare_approaches(work.scenario, work.folder.trajectories, network)
     contents = PageContents(
         work.scenario,
         ranking,
@@ -268,13 +276,13 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         stages,
         study=study_values(work.folder, stages),
         by_period=PeriodRanking.read(out),
-        plan=None if plan is None else plan_values(plan, ranking.sites, tpog, drawn.backdrop),
-        what_if=WhatIfSection.of(_current_what_ifs(work, stages), ranking.sites[0]),
-        movements=describe_counts(work.scenario, network_file(out)),
-        zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
-        points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
+        plan=None if plan is None else _plan_values(plan, ranking, tpog, drawn),
+        what_if=_read_what_ifs(work, stages, best),
+        movements=describe_counts(work.scenario, network),
+        zones=_read_zones(work, best, tpog, drawn, has_plan=plan is not None),
+        points=PointsSection.draw(work, mapped, mounts, tpog.grid, backdrop, moved=moved),
         approaches=approaches,
-        approach_map=draw_approach_map(work.scenario, network_file(out)),
+        approach_map=_draw_approach_map(work.scenario, network),
         sections=read_sections(work.folder, work.scenario, stages),
     )
     html = render_page(contents)
@@ -284,9 +292,69 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
     summary: Summary = {"kilobytes": round(len(html.encode("utf-8")) / 1000)}
     if approaches:
         summary["approaches"] = [approach.to_json() for approach in approaches]
-    if ranking.sites[0].score > 0:
-        summary = {"best": ranking.sites[0].site, "worst": ranking.last.site, **summary}
+    if best.score > 0:
+        summary = {"best": best.site, "worst": ranking.last.site, **summary}
     return summary
+
+
+# Modules of sections are imported for runs that have them.
+
+
+def _read_plan(folder: RunFolder, stages: Mapping[str, StageRecord]) -> SensorPlan | None:
+    """Return the plan in a run folder; None where there is none, or it does not belong to the run."""
+    if not folder.placement.is_file():
+        return None
+
+    from egvs.results.plans import SensorPlan
+
+    plan = SensorPlan.read(folder)
+    return plan if plan is not None and plan.belongs_to(stages) else None
+
+
+def _plan_values(plan: SensorPlan, ranking: Ranking, tpog: Tpog, drawn: Figures) -> dict[str, Any]:
+    from egvs.report.plan_section import plan_values
+
+    return plan_values(plan, ranking.sites, tpog, drawn.backdrop)
+
+
+def _read_what_ifs(work: StageContext, stages: Mapping[str, StageRecord], best: RankedSite) -> WhatIfSection | None:
+    current = _current_what_ifs(work, stages)
+    if not current:
+        return None
+
+    from egvs.report.what_if_section import WhatIfSection
+
+    return WhatIfSection.of(current, best)
+
+
+def _read_zones(
+    work: StageContext, best: RankedSite, tpog: Tpog, drawn: Figures, *, has_plan: bool
+) -> ZoneSection | None:
+    if work.scenario.score.zones is None:
+        return None
+
+    from egvs.report.zone_section import ZoneSection
+
+    return ZoneSection.read(work, best, tpog.grid, drawn.backdrop, has_plan=has_plan)
+
+
+def _draw_approach_map(scenario: Scenario, network: Path | None) -> str:
+    if network is None or not busiest_counts(scenario)[1]:
+        return ""
+
+    from egvs.report.approach_map import draw_approach_map
+
+    return draw_approach_map(scenario, network)
+
+
+def _draw_signals(stages: Mapping[str, StageRecord]) -> list[tuple[str, str, str]]:
+    plans = traffic_summary(stages).get("signals", ())
+    if not plans:
+        return []
+
+    from egvs.report.signal_diagram import signal_diagrams
+
+    return signal_diagrams(plans)
 
 
 def render_page(contents: PageContents) -> str:
@@ -299,7 +367,7 @@ def render_page(contents: PageContents) -> str:
         **_setting_values(contents),
         **_sensor_values(contents),
         **_cost_values(contents.stages),
-        "signals": signal_diagrams(traffic_summary(contents.stages).get("signals", ())),
+        "signals": _draw_signals(contents.stages),
         **_sentences(contents),
         **_warning_values(contents),
     }

@@ -14,7 +14,6 @@ from egvs.results.ranking import RankedSite
 from egvs.scoring.points_map import CLASS_LABELS, OVERLAP_POINTS, PointsMap, overlap_map
 from egvs.sensors.sites import Site
 from egvs.stages.base import StageContext
-from egvs.stages.plan_scans import plan_beams
 from egvs.stages.points_maps import points_maps, target_positions
 from egvs.stages.site_scans import empty_scans
 
@@ -74,6 +73,8 @@ class PointsSection:
                 figures.append(_site_figure(site, points, backdrop, box, f"points-{len(figures)}"))
         overlap: list[Map] = []
         if len(plan) > 1:
+            from egvs.stages.plan_scans import plan_beams
+
             from_sensors = [points for _, points in points_maps(work, positions, plan_beams(work, plan, moved=moved))]
             for positions_of_target in positions:
                 of_target = [points for points in from_sensors if points.target is positions_of_target.target]

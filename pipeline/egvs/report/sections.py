@@ -1,6 +1,4 @@
-"""Sections of the page on the results of other commands: ``egvs place``, ``egvs accuracy``.
-
-A result is shown if it was computed from the same inputs as the run.
+"""What the ranking rests on and the evidence of the validation study, in sentences; the section on ``egvs accuracy``.
 
 :func:`ranking_disagreement` compares the EGVS with the recommended score by the evidence of the validation study
 (:mod:`egvs.results.study_results`); a setting that was not measured is not in it.
@@ -18,23 +16,14 @@ from typing import Any
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
-from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import Diagnostic
-from egvs.core.wording import format_percent
-from egvs.drawing import maps, svg_figures
-from egvs.drawing.maps import Backdrop, PlannedPole
-from egvs.drawing.svg_figures import CurveStep
-from egvs.report import plan_answer
 from egvs.results.labels import SCORE_LABELS, join_names
-from egvs.results.plans import PlannedSensor, SensorPlan
 from egvs.results.ranking import Pole, RankedSite
-from egvs.results.studies import AccuracyResults
 from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 from egvs.scenario.signal_config import ASSUMED_PLANS
-from egvs.traffic.movements import MovementNames
-from egvs.traffic.network import read_net_xml
+from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.signal_descriptions import ASSUMED_SOURCE, plan_title
 
 COMPARED_SITES = 3
@@ -153,6 +142,13 @@ def assumes_flows(scenario: Scenario) -> bool:
     return any(_TRAFFIC.search(entry) for entry in scenario.assumed)
 
 
+def busiest_counts(scenario: Scenario) -> tuple[str, tuple[CountConfig, ...]]:
+    """Return the period with most vehicles per hour (empty without periods) and its counts."""
+    periods = {name: period.traffic.counts for name, period in scenario.by_period().items()}
+    name = max(periods, key=lambda period: math.fsum(count.per_hour for count in periods[period]))
+    return name, periods[name]
+
+
 def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:
     """Return the movement of each traffic count in words, by its location in the summary of the traffic.
 
@@ -166,6 +162,9 @@ def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:
     periods = {name: period.traffic for name, period in scenario.by_period().items() if period.traffic.counts}
     if network is None or not periods:
         return {}
+    from egvs.traffic.movements import MovementNames
+    from egvs.traffic.network import read_net_xml
+
     x_m, y_m, _ = scenario.roi.center_m
     flows = [count for traffic in periods.values() for count in traffic.counts]
     names = MovementNames(read_net_xml(network), (x_m, y_m), flows)
@@ -244,90 +243,17 @@ def _describe_evidence(noun: str, egvs: str, rho: Mapping[str, Mapping[str, floa
     return f"{where}, {verdict}: mean rank correlation {values}. That of {noun} is {RHO_RANGE}; see docs/validity.md."
 
 
-# ---- egvs place
-
-
-def plan_values(
-    plan: SensorPlan, candidates: Sequence[RankedSite], tpog: Tpog, backdrop: Backdrop
-) -> dict[str, SensorPlan | str]:
-    """Return what the page shows of a plan, by the names of the template: the plan, sentences, and figures (SVG text).
-
-    Parameters
-    ----------
-    plan
-        The plan.
-    candidates, tpog, backdrop
-        Contents of the map.
-    """
-    occupied = tpog.counts.sum(axis=2) / tpog.frames
-    alt = f"Map of the plan: {', '.join(sensor.site for sensor in plan.sensors)}."
-    return {
-        "plan": plan,
-        "plan_proof": _describe_proof(plan),
-        "plan_objective": plan_answer.describe_objective(plan.request),
-        "plan_answer": plan_answer.describe_plan_count(plan),
-        "plan_assumption": plan_answer.describe_joint_score(plan.by, len(plan.sensors)),
-        "plan_map": maps.plan_map(tpog.grid, occupied, backdrop, candidates, _planned_poles(plan), alt),
-        "plan_chart": _curve_chart(plan),
-    }
-
-
-def _curve_chart(plan: SensorPlan) -> str:
-    whole = plan.joint_of_all or math.inf
-    if plan.request["objective"] == "worst":
-        whole = 1.0  # the values of this objective are shares already
-    steps = [CurveStep(step.count, step.value / whole, step.bound / whole) for step in plan.curve]
-    alt = "Score of the best plan for each number of sensors, and its upper bound."
-    return svg_figures.sensor_count_chart(steps, alt)
-
-
-def _describe_proof(plan: SensorPlan) -> str:
-    sensors = len(plan.sensors)
-    if plan.fewest_is_proved is None:
-        if plan.is_best:
-            return "it is proved that no plan within the rules is better"
-        percent = math.floor(1e4 * plan.certificate) / 1e2
-        return f"the plan is proved to reach at least {percent:.2f} % of the best possible score"
-    if sensors == 1:
-        return "one sensor is enough"
-    fewer = "1 sensor is" if sensors == 2 else f"{sensors - 1} sensors are"
-    if plan.fewest_is_proved:
-        return f"it is proved that {fewer} not enough"
-    return f"it is not proved that {fewer} not enough"
-
-
-def _planned_poles(plan: SensorPlan) -> list[PlannedPole]:
-    """One mark per location; sensors at the same location share it."""
-    sensors_at: dict[tuple[float, float], list[PlannedSensor]] = {}
-    for sensor in plan.sensors:
-        sensors_at.setdefault((sensor.x_m, sensor.y_m), []).append(sensor)
-    poles = []
-    for (x_m, y_m), members in sensors_at.items():
-        name = members[0].site
-        if len(members) > 1:
-            name += f" +{len(members) - 1}"
-        gain = 0.0
-        if plan.joint:
-            gain = sum(sensor.gain for sensor in members) / plan.joint
-        numbers, details = [], []
-        for sensor in members:
-            numbers.append(str(sensor.order))
-            adds = plan.by.with_unit(sensor.gain)
-            details.append(f"{sensor.order}. {sensor.site}, {sensor.z_m:g} m high, adds {adds}")
-        poles.append(
-            PlannedPole(x_m, y_m, ", ".join(numbers), f"{name}: {format_percent(gain, 0)}", "; ".join(details))
-        )
-    return poles
-
-
 # ---- egvs accuracy
 
 
 def study_values(folder: RunFolder, stages: Mapping[str, StageRecord]) -> dict[str, Any]:
     """Return what the page shows of the accuracy study of a run; ``study`` is None without one."""
-    study = None
-    if folder.accuracy_figure.is_file():
-        study = AccuracyResults.read(folder, stages)
+    if not folder.accuracy_figure.is_file():
+        return {"study": None}
+
+    from egvs.results.studies import AccuracyResults
+
+    study = AccuracyResults.read(folder, stages)
     if study is None:
         return {"study": None}
     tolerance = f"{study.tolerance.loss_points:g} percentage points of vehicles found"

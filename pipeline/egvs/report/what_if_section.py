@@ -32,10 +32,10 @@ class WhatIfRow:
 
 @dataclass(frozen=True)
 class WhatIfSection:
-    """Results of ``egvs what-if`` for a run; empty without any."""
+    """Results of ``egvs what-if`` for a run."""
 
-    rows: tuple[WhatIfRow, ...] = ()
-    change_unit: str = ""
+    rows: tuple[WhatIfRow, ...]
+    change_unit: str
 
     @classmethod
     def of(cls, current: Entries, best: RankedSite) -> WhatIfSection:

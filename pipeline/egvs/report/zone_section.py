@@ -71,12 +71,12 @@ class ZoneSection:
     def read(
         cls, work: StageContext, best: RankedSite, grid: Grid, backdrop: Backdrop, *, has_plan: bool
     ) -> ZoneSection | None:
-        """Read the zones of a run; None where its scenario has none, or no road user was in any.
+        """Read the zones of a run; None where no road user was in any.
 
         Parameters
         ----------
         work
-            The run.
+            A run of a scenario with zones.
         best
             The best site.
         grid, backdrop
@@ -84,8 +84,6 @@ class ZoneSection:
         has_plan
             Whether the run has a plan.
         """
-        if work.scenario.score.zones is None:
-            return None
         zones = read_zones(work.folder.zones, best.site)
         if not zones:
             return None

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from egvs.artefacts import checksums
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import digests, files
 from egvs.core.digests import Digests, Entries
@@ -25,7 +26,7 @@ def remember_digests(folder: RunFolder, *, trusted: bool = True) -> Iterator[Dig
     entries = {name: entry for name, entry in sorted(current.entries.items()) if Path(name).exists()}
     if entries != earlier:
         with suppress(OSError):  # a cache that cannot be written costs time, nothing else
-            files.write_text(folder.digests, files.to_json_text(files.add_checksum({"files": entries})) + "\n")
+            files.write_text(folder.digests, files.to_json_text(checksums.add_checksum({"files": entries})) + "\n")
 
 
 def _read_entries(path: Path) -> Entries:
@@ -34,7 +35,7 @@ def _read_entries(path: Path) -> Entries:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    if not files.has_valid_checksum(value):
+    if not checksums.has_valid_checksum(value):
         return {}
     entries: Entries = value["files"]
     return entries

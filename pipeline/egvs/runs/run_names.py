@@ -1,4 +1,4 @@
-"""Names of run folders: a folder holds the results of one set of settings.
+"""Names of run folders where none is given, from the settings that differ: ``runs/<name>@<label>``.
 
 ``runs/<name>`` is the folder of a scenario, or a city, as it is written. With overrides, the folder is
 ``runs/<name>@<label>``. The label is the same for the same overrides, in whatever order and spelling they are given:
@@ -32,7 +32,7 @@ from pydantic import BaseModel
 from egvs.artefacts.run_folder import RUNS
 from egvs.core import files, reading
 from egvs.scenario.model import Scenario
-from egvs.scenario.settings import flatten_settings
+from egvs.scenario.settings import effect_state, flatten_settings
 
 MAX_LABEL_LENGTH = 40
 """Characters of a label before its hash."""
@@ -95,29 +95,6 @@ def short_key(key: str) -> str:
         if _last_parts()[name] == 1:
             return name
     return key.replace("[", ".").replace("]", "")
-
-
-def effect_state(key: str, value: Any) -> str:
-    """Return "on" for an effect with its default parameters, "off" for one without any; empty for other settings.
-
-    Parameters
-    ----------
-    key
-        Full key.
-    value
-        Its value; None where it is not set.
-
-    Examples
-    --------
-    >>> effect_state("effects.range_limit", {}), effect_state("effects.range_limit", None), effect_state("seed", 1)
-    ('on', 'off', '')
-    """
-    prefix, _, name = key.partition(".")
-    if prefix != "effects" or not name or "." in name:
-        return ""
-    if value is None:
-        return "off"
-    return "on" if value == {} else ""
 
 
 def parse_overrides(overrides: Iterable[str]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Results cached by a hash of their inputs (:mod:`egvs.runs.stage_keys`).
+"""The store: results of stages cached by a hash of their inputs (:mod:`egvs.runs.stage_keys`).
 
 The cache is a folder on this machine, and optionally a store shared by machines::
 

@@ -98,3 +98,26 @@ def changed_settings(base: Mapping[str, Any], values: Mapping[str, Any]) -> Sett
 def _is_table(key: str, settings: Settings) -> bool:
     """Whether the settings have keys below this one, which another scenario has as an empty table."""
     return any(other.startswith((f"{key}.", f"{key}[")) for other in settings)
+
+
+def effect_state(key: str, value: Any) -> str:
+    """Return "on" for an effect with its default parameters, "off" for one without any; empty for other settings.
+
+    Parameters
+    ----------
+    key
+        Full key.
+    value
+        Its value; None where it is not set.
+
+    Examples
+    --------
+    >>> effect_state("effects.range_limit", {}), effect_state("effects.range_limit", None), effect_state("seed", 1)
+    ('on', 'off', '')
+    """
+    prefix, _, name = key.partition(".")
+    if prefix != "effects" or not name or "." in name:
+        return ""
+    if value is None:
+        return "off"
+    return "on" if value == {} else ""

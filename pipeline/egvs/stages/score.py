@@ -15,7 +15,6 @@ import numpy as np
 import pyarrow as pa
 
 from egvs.artefacts import parquet, readers
-from egvs.artefacts.extra_columns import extra_columns
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import WARNINGS_KEY, Diagnostic
@@ -26,7 +25,7 @@ from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scenario.score_config import SCORES_IN_UNITS
-from egvs.scoring import score_table, standard_errors, zone_results, zones
+from egvs.scoring import score_table, standard_errors, zones
 from egvs.scoring.score_table import ScoreTable
 from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
@@ -196,14 +195,22 @@ def _write_zones(
     if scoring.zones is None:
         context.folder.zones.unlink(missing_ok=True)
         return
+
+    from egvs.scoring.zone_results import write_zones
+
     in_zones = [(site.site.name, site.zones) for site in sites if site.zones is not None]
     areas = zones.reported_settings(context.scenario)
-    zone_results.write_zones(context.folder.zones, scoring.zones, in_zones, metadata | areas)
+    write_zones(context.folder.zones, scoring.zones, in_zones, metadata | areas)
 
 
 def _user_columns(context: StageContext) -> dict[str, pa.Array]:
     """The user's columns of the sites file, in the order of the sites."""
     rows = [site.user_columns for site in context.scene.sites]
+    if not any(rows):
+        return {}
+
+    from egvs.artefacts.extra_columns import extra_columns
+
     return extra_columns(rows, parquet.column_names("scores"))
 
 

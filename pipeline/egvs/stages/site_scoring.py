@@ -48,7 +48,6 @@ from egvs.scoring.targets import (
     weights_in_mix,
 )
 from egvs.scoring.visibility import Beams, to_voxel_units
-from egvs.scoring.zone_results import ZoneUsers
 from egvs.scoring.zones import reported_zones, weight_zones
 from egvs.sensors.sensor import resolve_sensor
 from egvs.sensors.sites import Pose, ScannedSite
@@ -60,6 +59,8 @@ from egvs.world.carriageway import Carriageway
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
+
+    from egvs.scoring.zone_results import ZoneUsers
 
 _ROI_HINT = "Check that the region of interest contains the road."
 
@@ -101,6 +102,8 @@ def zone_users(context: StageContext) -> ZoneUsers:
     context
         Its folder has ``trajectories.parquet`` and the ``tpog.parquet`` that was counted from it.
     """
+    from egvs.scoring.zone_results import ZoneUsers
+
     trajectories, tpog = context.folder.trajectories, context.folder.tpog
     frames = context.scenario.score.sampled_frames
     record = TargetRecord.read(trajectories, read_tpog(tpog).grid, frames, NON_VEHICLE_KINDS)

@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.artefacts.frame_boxes import FrameBoxes, read_boxes
+from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY, FrameBoxes, read_boxes
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import PeriodBlocks, frame_multiplicities
 from egvs.core.errors import WARNINGS_KEY, InputError
@@ -26,10 +26,12 @@ from egvs.core.progress import ProgressCallback
 from egvs.scenario.model import Scenario
 from egvs.scoring import occupancy
 from egvs.scoring.occupancy import BlockCounts, count_blocks, static_voxels
-from egvs.scoring.unknown_occupancy import UnknownOccupancy
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.statistics.blocks import autocorrelation_time
 from egvs.world.mesh import World
+
+if TYPE_CHECKING:
+    from egvs.scoring.unknown_occupancy import UnknownOccupancy
 
 
 def dependencies(context: StageContext) -> StageDependencies:
@@ -75,13 +77,15 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
     periods: list[PeriodBlocks] = []
     boxes_in_roi = []
     left_over = 0
-    unknown = UnknownOccupancy.from_metadata(parquet.read_metadata(source, "trajectories"), grid)
+    unknown = _read_unknown(source, grid)
     first_frame = 0
     with parquet.artefact_writer(context.folder.tpog, "tpog") as file:
         for name, recorded, seeds, boxes in _recorded_periods(source, grid):
             unused = _leftover_frames(by_period.get(name, scenario), recorded)
             frames = recorded - unused
-            blocks = _known_blocks(count_blocks(boxes, grid, frames // n_blocks, n_blocks), unknown, first_frame)
+            blocks = count_blocks(boxes, grid, frames // n_blocks, n_blocks)
+            if unknown is not None:
+                blocks = _known_blocks(blocks, unknown, first_frame)
             first_frame += recorded
             boxes_near = writer.write(file, blocks, n_blocks * len(periods), context.progress)
             boxes_in_roi.append(int(boxes_near.sum()) / frames)
@@ -106,7 +110,9 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
         "boxes_in_roi": mean_boxes,
         "memory_frames": memory,
         WARNINGS_KEY: [warning.to_json() for warning in warnings],
-    } | unknown.summary()
+    }
+    if unknown is not None:
+        summary |= unknown.summary()
     if left_over:
         total = sum(period.frames for period in periods) + left_over
         summary["left_over"] = f"the last {left_over} of {total} frames, so that {n_blocks} blocks are alike"
@@ -149,6 +155,17 @@ class _BlockWriter:
             boxes.append(boxes_near)
             progress("blocks", block + 1, 0)
         return np.concatenate(boxes)
+
+
+def _read_unknown(trajectories: Path, grid: Grid) -> UnknownOccupancy | None:
+    """Return what the recording does not know; None where it knows all positions."""
+    metadata = parquet.read_metadata(trajectories, "trajectories")
+    if not metadata.get(UNKNOWN_BOXES_KEY):
+        return None
+
+    from egvs.scoring.unknown_occupancy import UnknownOccupancy
+
+    return UnknownOccupancy.from_metadata(metadata, grid)
 
 
 def _known_blocks(blocks: Iterator[BlockCounts], unknown: UnknownOccupancy, first_frame: int) -> Iterator[BlockCounts]:

@@ -32,7 +32,6 @@ from egvs.core.threads import map_ordered
 from egvs.effects import registry
 from egvs.scenario.model import TERRAIN_KEY, Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
-from egvs.stages.seed_summaries import merge_seed_summaries
 from egvs.traffic import (
     finished_fcd,
     network,
@@ -222,6 +221,9 @@ def _record_period(
             window = replace(recorded.window, count=frames)
     if len(runs) == 1:
         return window, summaries[0], unknown
+
+    from egvs.stages.seed_summaries import merge_seed_summaries
+
     return window, merge_seed_summaries(summaries, [run.seed for run in runs]), unknown
 
 

@@ -1,4 +1,4 @@
-r"""Values with 95 % intervals.
+r"""Means, medians, scales and shares with 95 % intervals.
 
 Of independent observations, a count of k has the exact interval of a Poisson mean, from
 :math:`\chi^2_{0.025}(2 k) / 2` to :math:`\chi^2_{0.975}(2 k + 2) / 2` (Garwood 1936), a share that of Clopper and

@@ -21,9 +21,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from egvs.artefacts.checksums import CHECKSUM_KEY, add_checksum, has_valid_checksum
 from egvs.core import files, reading
 from egvs.core.errors import InputError, RunError
-from egvs.core.files import CHECKSUM_KEY, add_checksum, has_valid_checksum
 from egvs.core.progress import ProgressCallback
 from egvs.core.resource_usage import ResourceUsage, release_memory
 from egvs.runs import stage_keys, stage_registry

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +28,10 @@ from egvs.scenario.model import MeshConfig, Scenario
 from egvs.world import geolocation
 from egvs.world.extrusion import extrude_polygon
 from egvs.world.footprints import GROUND_DATUM, Footprint, read_footprints
-from egvs.world.map_features import SolidTypes
 from egvs.world.mesh import World
-from egvs.world.sumo_polygons import read_poly_location, read_poly_xml
-from egvs.world.terrain import GroundSource, TerrainSurface
+
+if TYPE_CHECKING:
+    from egvs.world.terrain import GroundSource, TerrainSurface
 
 Floats = NDArray[np.float64]
 
@@ -112,15 +112,19 @@ def build_world(
     config = scenario.statics
     builder = _Builder()
     world = geolocation.scenario_georeference(scenario)
-    types = SolidTypes(config.polygon_types)
     files = [read_footprints(scenario.find(name, _FOOTPRINTS), world) for name in config.footprints]
     names = [(_FOOTPRINTS, name) for name in config.footprints]
-    location = geolocation.network_location(scenario)
-    for name in config.polygons:
-        path = scenario.find(name, _POLYGONS)
-        files.append(read_poly_xml(path, types, config.polygon_height_m, world, location))
-        names.append((_POLYGONS, name))
-        location = location or read_poly_location(path)
+    if config.polygons:
+        from egvs.world.map_features import SolidTypes
+        from egvs.world.sumo_polygons import read_poly_location, read_poly_xml
+
+        types = SolidTypes(config.polygon_types)
+        location = geolocation.network_location(scenario)
+        for name in config.polygons:
+            path = scenario.find(name, _POLYGONS)
+            files.append(read_poly_xml(path, types, config.polygon_height_m, world, location))
+            names.append((_POLYGONS, name))
+            location = location or read_poly_location(path)
     footprints: list[Footprint] = []
     for (key, name), file in zip(names, files, strict=True):
         first = len(footprints)

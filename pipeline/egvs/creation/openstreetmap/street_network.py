@@ -30,7 +30,7 @@ from egvs.creation.junctions import StreetJunction, Streets
 from egvs.creation.openstreetmap import ATTRIBUTION
 from egvs.creation.plain_network import NETWORK_FILE
 from egvs.formats import xml
-from egvs.formats.osm import OsmExtract, Way, parse_number, write_streets
+from egvs.formats.osm import OsmExtract, Way, parse_number
 from egvs.traffic import sumo, sumo_folder
 from egvs.traffic.network import Location
 
@@ -134,7 +134,7 @@ def build_network(
         raise no_streets
 
     with files.temporary_folder() as folder:
-        write_streets(extract, folder / "streets.osm.xml")
+        _write_streets(extract, folder / "streets.osm.xml")
         try:
             arguments = ["--osm-files", "streets.osm.xml", *flags, *_frame_flags(frame)]
             sumo.run_netconvert(arguments, folder, NETWORK_FILE)
@@ -407,3 +407,24 @@ def _connected_roads(extract: OsmExtract, circle: _Circle) -> set[int]:
         for node in way.nodes:
             queue += roads_at_node[node]
     return reached
+
+
+def _write_streets(extract: OsmExtract, xml: Path) -> None:
+    """Write the streets (ways with ``highway``), their nodes, and the turn restrictions as an OpenStreetMap file."""
+    import osmium
+    from osmium.osm import mutable
+
+    streets = [way for way in extract.ways.values() if "highway" in way.tags]
+    with osmium.SimpleWriter(osmium.io.File(xml, "osm")) as writer:
+        for node in sorted({n for way in streets for n in way.nodes if n in extract.nodes}):
+            lat_deg, lon_deg = extract.nodes[node]
+            tags = sorted(extract.node_tags.get(node, {}).items())
+            writer.add_node(mutable.Node(id=node, location=(lon_deg, lat_deg), tags=tags))
+        for way in streets:
+            nodes = [n for n in way.nodes if n in extract.nodes]
+            writer.add_way(mutable.Way(id=way.id, nodes=nodes, tags=sorted(way.tags.items())))
+        for relation in extract.relations:
+            if relation.tags.get("type") == "restriction":
+                members = [(member.type[0], member.id, member.role) for member in relation.members]
+                tags = sorted(relation.tags.items())
+                writer.add_relation(mutable.Relation(id=relation.id, members=members, tags=tags))

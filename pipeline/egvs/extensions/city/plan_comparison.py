@@ -27,6 +27,7 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.extensions.city import results
 from egvs.extensions.city.results import CityPlan, junction_run_folder, mean_vehicles, score_factor
 from egvs.placement import problem_builder
+from egvs.placement.problem import CoverageState
 from egvs.results.plans import PlannedSensor
 from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import scenario_from_dict
@@ -171,7 +172,13 @@ def _joint_scores(run: Path, plans: Sequence[Sequence[str]]) -> FloatArray:
         hint = "Compare runs with the same candidates at every junction."
         raise InputError(run, f"there is no site {site}, which is in the plan of another run", hint)
     factor = score_factor(context.scenario.score.rank_by, mean_vehicles(run))
-    return factor * np.array(problem_builder.joint_scores(context, plans))
+    used = [site.name for site in context.scene.sites if site.name in set().union(*plans)]
+    if not used:
+        return np.zeros(len(plans))
+    objective = problem_builder.make_objective(context, problem_builder.read_tpogs(context))
+    (visibility,) = problem_builder.visibility_matrices(context, (objective.view,), lambda _: None, only=used)
+    term = objective.terms(visibility)[""]
+    return factor * np.array([CoverageState([term], map(used.index, plan)).value(term) for plan in plans])
 
 
 def _open_run(folder: Path) -> StageContext:

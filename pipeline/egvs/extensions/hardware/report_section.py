@@ -10,20 +10,21 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
 from egvs.extensions.hardware.files import ACCEPTANCE, FILES, SENSOR_DESIGN, SHEETS, design_digest
 from egvs.report.extension_sections import SectionWarning
-from egvs.results.command_entries import Entries, current_entries
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.plans import SensorPlan
 from egvs.results.ranking import RankedSite
 from egvs.results.sensors import ScoreDifference
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.sensors.sites import Pose
+
+if TYPE_CHECKING:
+    from egvs.results.command_entries import Entries
 
 _POSE_TOLERANCE = 1e-6
 
@@ -90,6 +91,11 @@ class HardwareResults:
     @classmethod
     def read(cls, folder: RunFolder, scenario: Scenario, stages: Mapping[str, StageRecord]) -> HardwareResults | None:
         """Read the results in a run folder; None if there are none of this run."""
+        if not any((folder / file.name).is_file() for file in FILES):
+            return None
+
+        from egvs.results.command_entries import current_entries
+
         designs = current_entries(folder / SENSOR_DESIGN.name, stages, lambda _: design_digest(scenario))
         sheets = current_entries(folder / SHEETS.name, stages)
         checks = current_entries(folder / ACCEPTANCE.name, stages)
@@ -110,6 +116,8 @@ class HardwareResults:
 
 def _present_poses(folder: RunFolder, stages: Mapping[str, StageRecord]) -> dict[str, Pose]:
     """Return the poses of the sites of a run; a site of its plan has the planned one."""
+    from egvs.results.plans import SensorPlan
+
     poses = {site.site: site.pose for site in RankedSite.read(folder.scores)}
     plan = SensorPlan.read(folder)
     if plan is not None and plan.belongs_to(stages):

@@ -72,7 +72,7 @@ from egvs.extensions.validation.detector_results import (
     PointCounts,
     concatenate_boxes,
 )
-from egvs.kernels import detection
+from egvs.extensions.validation.kernels import detection
 
 BLOCKS = 10
 """Default number of blocks of frames."""

@@ -169,10 +169,10 @@ _MEASURE_LABELS = {
 def write_figure(path: Path, scenario: Scenario, validation: Validation) -> None:
     """Write the figure as a PNG."""
     with files.atomic_write(path) as partial:
-        make_figure(scenario, validation).savefig(partial, dpi=150, format="png", metadata={"Software": None})
+        validation_figure(scenario, validation).savefig(partial, dpi=150, format="png", metadata={"Software": None})
 
 
-def make_figure(scenario: Scenario, validation: Validation) -> Figure:
+def validation_figure(scenario: Scenario, validation: Validation) -> Figure:
     """Return the figure, laid out."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

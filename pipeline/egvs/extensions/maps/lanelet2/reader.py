@@ -223,7 +223,7 @@ def _problem_notes(
         yield f"Lanelets without one left and one right bound, left out: {_count(lanelet_map.incomplete)}."
     if lanelet_map.missing_members:
         yield f"Members of regulatory elements that are not in the file, ignored: {lanelet_map.missing_members}."
-    if reversed_keys := find_reversed(graph):
+    if reversed_keys := find_reversed_lanelets(graph):
         yield (
             "Lanelets that seem to run the wrong way, since they would continue others if their bounds were swapped: "
             f"{_count(reversed_keys)}. They are taken as the map states."
@@ -268,7 +268,7 @@ def _count(values: Collection[object], limit: int = 5) -> str:
     return f"{len(texts)} ({', '.join([*texts[:limit], *more])})"
 
 
-def find_reversed(graph: LaneletGraph) -> list[LaneletKey]:
+def find_reversed_lanelets(graph: LaneletGraph) -> list[LaneletKey]:
     """Return the lanelets that continue nothing as they are, but would continue others if they ran the other way."""
     starts = {(lanelet.left_ends[0], lanelet.right_ends[0]): key for key, lanelet in graph.lanelets.items()}
     ends = {(lanelet.left_ends[1], lanelet.right_ends[1]): key for key, lanelet in graph.lanelets.items()}

@@ -3,8 +3,8 @@ r"""The detector ``cluster``: background subtraction, clusters, boxes, as is com
 Steps for a sweep: subtract the background beam by beam, and measure heights from the ground
 (:mod:`egvs.extensions.validation.detectors.background`); cluster the points
 (:mod:`egvs.extensions.validation.detectors.clustering`); fit a rectangle to each cluster by the closeness criterion
-(:mod:`egvs.kernels.detection`); find out what hides the rest of it; fit a box of a typical size, which extends away
-from the sensor. People and bicycles are kinds of road users too, and are dropped at the end.
+(:mod:`egvs.extensions.validation.kernels.detection`); find out what hides the rest of it; fit a box of a typical size,
+which extends away from the sensor. People and bicycles are kinds of road users too, and are dropped at the end.
 
 **Occlusion.** The empty scan contains walls, poles and trees, the sweep the other road users. Their nearest ranges are
 stored in an image of azimuth and elevation. Beside a cluster, at its elevations, the image is followed as long as
@@ -49,7 +49,7 @@ from egvs.extensions.validation.detectors import background
 from egvs.extensions.validation.detectors.background import GroundMap, empty_scan_points
 from egvs.extensions.validation.detectors.base import AtOneSite, suppress_overlaps
 from egvs.extensions.validation.detectors.clustering import Clusters, Density, find_clusters
-from egvs.kernels import detection
+from egvs.extensions.validation.kernels import detection
 from egvs.sensors.sensor import Sensor
 
 KINDS_FILE = Path(__file__).with_name("kinds.toml")

@@ -3,13 +3,13 @@
 Steps for a sweep:
 
 1. *New points*: returns well before those of the empty scan (:mod:`egvs.extensions.validation.detectors.background`),
-  near the
-   region of interest, and not on the ground.
+   near the region of interest, and not on the ground.
 2. *Segments*: points of neighbouring beams are joined unless the range jumps between them (depth-angle criterion of
    Bogoslavskyi and Stachniss 2016). Neighbours are found by the directions of beams, so this works for rings and for
    patterns that do not repeat. It is done with several limits (:data:`LEVELS`), from strict to generous:
    a queue is one segment with generous limits, and a partly hidden vehicle is several with strict ones.
-3. *Rectangles*: two for each segment, by variance and by area (Zhang et al. 2017; :mod:`egvs.kernels.range_segments`).
+3. *Rectangles*: two for each segment, by variance and by area (Zhang et al. 2017;
+   :mod:`egvs.extensions.validation.kernels.range_segments`).
 4. *Kind, box, confidence*: decision trees that were trained on simulated sweeps
    (:mod:`egvs.extensions.validation.detectors.segment_model`) tell what a segment is, how far the vehicle extends
    beyond the points, and how sure that is.
@@ -37,7 +37,7 @@ from egvs.extensions.validation.detectors import background, segment_model
 from egvs.extensions.validation.detectors.background import GroundMap
 from egvs.extensions.validation.detectors.base import suppress_overlaps
 from egvs.extensions.validation.detectors.segment_model import SEGMENT_KINDS, VEHICLE_KINDS, SegmentModel
-from egvs.kernels import range_segments
+from egvs.extensions.validation.kernels import range_segments
 from egvs.sensors.sensor import Sensor
 
 LEVELS = ((10.0, 0.15, 0.3), (10.0, 0.25, 0.6), (8.0, 0.4, 1.0))
@@ -78,7 +78,7 @@ FEATURES = (
     "log_points", "range_m", "sensor_height_m", "spacing_m", "cos_view_a", "length_a_m", "length_b_m", "level",
     "criterion", "criterion_value", *range_segments.SUMMARY[1:],
 )  # fmt: skip
-"""Of each segment; the last ones as in :data:`egvs.kernels.range_segments.SUMMARY`."""
+"""Of each segment; the last ones as in :data:`egvs.extensions.validation.kernels.range_segments.SUMMARY`."""
 
 BOX_FEATURES = (*SEGMENT_KINDS, "length_m", "width_m", "height_m", *segment_model.MARGINS)
 """What the confidence of a box depends on besides :data:`FEATURES`."""

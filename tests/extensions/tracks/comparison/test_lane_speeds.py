@@ -10,13 +10,13 @@ import pytest
 from scipy.stats import wasserstein_distance
 
 from egvs.artefacts.tpog import read_tpog
+from egvs.extensions.tracks.comparison import lane_speeds, speed_figure, tpog_page
+from egvs.extensions.tracks.comparison.lane_bins import lane_bins
+from egvs.extensions.tracks.comparison.lane_speeds import BIN_M_S, N_BINS, read_lane_speeds, speed_distances
+from egvs.extensions.tracks.comparison.tpog_comparison import compare_tpogs
 from egvs.scoring.standard_errors import BlockGroups
-from egvs.studies import lane_speeds, speed_figure, tpog_page
-from egvs.studies.lane_bins import lane_bins
-from egvs.studies.lane_speeds import BIN_M_S, N_BINS, read_lane_speeds, speed_distances
-from egvs.studies.tpog_comparison import compare_tpogs
 from egvs.traffic.network import read_net_xml
-from tests.studies.test_tpog_comparison import make_run
+from tests.extensions.tracks.comparison.test_tpog_comparison import make_run
 
 
 def test_distance_by_hand() -> None:

@@ -24,8 +24,8 @@ import pyarrow.compute as pc
 from egvs.artefacts import traffic_frames
 from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
 from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.extensions.tracks.comparison.lane_bins import LaneBins
 from egvs.scoring.standard_errors import BlockGroups
-from egvs.studies.lane_bins import LaneBins
 
 BIN_M_S = 0.5
 """Width of the bins of speeds."""

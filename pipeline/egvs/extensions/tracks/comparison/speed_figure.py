@@ -10,7 +10,7 @@ import numpy as np
 from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
 from egvs.drawing.svg_figures import FigureStyle, round_values, svg_start_tag
-from egvs.studies.lane_speeds import BIN_M_S
+from egvs.extensions.tracks.comparison.lane_speeds import BIN_M_S
 
 _WIDTH, _HEIGHT = 360.0, 190.0
 _LEFT, _TOP, _RIGHT, _BOTTOM = 44.0, 10.0, 12.0, 40.0

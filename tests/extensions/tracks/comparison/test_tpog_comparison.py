@@ -11,10 +11,10 @@ from scipy.spatial.distance import jensenshannon
 import egvs
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
+from egvs.extensions.tracks.comparison import tpog_page
+from egvs.extensions.tracks.comparison.lane_bins import BIN_M, lane_bins, lane_distances
+from egvs.extensions.tracks.comparison.tpog_comparison import Measured, compare_tpogs, measure
 from egvs.scoring.standard_errors import BlockGroups
-from egvs.studies import tpog_page
-from egvs.studies.lane_bins import BIN_M, lane_bins, lane_distances
-from egvs.studies.tpog_comparison import Measured, compare_tpogs, measure
 from egvs.traffic.network import read_net_xml
 from tests.conftest import write_mini
 from tests.installed import needs

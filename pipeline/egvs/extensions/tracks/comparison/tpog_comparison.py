@@ -1,8 +1,8 @@
 r"""Compare the traffic of two runs: a recorded TPOG with a simulated one.
 
 Columns of voxels are assigned to the nearest lane in whose strip they are, and to bins along it
-(:mod:`egvs.studies.lane_bins`). With p(c) the share of frames in which column c is occupied, at the height where that
-is most often, the occupancy of a bin is the mean of its columns.
+(:mod:`egvs.extensions.tracks.comparison.lane_bins`). With p(c) the share of frames in which column c is occupied, at
+the height where that is most often, the occupancy of a bin is the mean of its columns.
 
 - **Distance** of a lane: the Jensen-Shannon distance (Endres and Schindelin 2003) between the two distributions Q of
   occupancy over its bins, each with the sum 1; M is their mean, logarithms are to base 2:
@@ -12,7 +12,8 @@ is most often, the occupancy of a bin is the mean of its columns.
   It tells where along the lane vehicles are, from 0 (the same) to 1 (never in the same bin). How many there are is a
   number of its own: the mean occupancy of the lane.
 - **Entropy**: the sum over its voxels, bits.
-- **Speeds** (:mod:`egvs.studies.lane_speeds`): mean, and Wasserstein distance of the two distributions.
+- **Speeds** (:mod:`egvs.extensions.tracks.comparison.lane_speeds`): mean, and Wasserstein distance of the two
+  distributions.
 - **Ranks**: Kendall's tau-b over the sites of the same name, by the score that ranks, and the share of the best
   recorded score that is lost at the best simulated site.
 
@@ -41,6 +42,15 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.drawing.basemap import network_file, roads_within, world_outlines
 from egvs.drawing.maps import Backdrop
 from egvs.drawing.svg_figures import extent
+from egvs.extensions.tracks.comparison import lane_speeds
+from egvs.extensions.tracks.comparison.lane_bins import (
+    LaneBins,
+    column_centres_m,
+    lane_bins,
+    lane_distances,
+    mean_groups,
+    sum_groups,
+)
 from egvs.results.ranking import RankedSite, Ranking
 from egvs.runs.run_context import open_folder
 from egvs.runs.stage_registry import recorded_digests
@@ -48,8 +58,6 @@ from egvs.scenario.loading import scenario_from_dict
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages.base import StageContext
 from egvs.statistics.ranks import rank_agreement, regret
-from egvs.studies import lane_speeds
-from egvs.studies.lane_bins import LaneBins, column_centres_m, lane_bins, lane_distances, mean_groups, sum_groups
 from egvs.studies.paired_errors import SiteReplicates, read_replicates
 from egvs.traffic import network, traffic_sources
 from egvs.world import geolocation

@@ -13,8 +13,8 @@ from egvs.drawing import maps, pages
 from egvs.drawing.colours import ColumnValues
 from egvs.drawing.maps import MapScale
 from egvs.drawing.svg_figures import FigureStyle
-from egvs.studies import speed_figure
-from egvs.studies.tpog_comparison import LaneComparison, Measured, TpogComparison
+from egvs.extensions.tracks.comparison import speed_figure
+from egvs.extensions.tracks.comparison.tpog_comparison import LaneComparison, Measured, TpogComparison
 
 TEMPLATES = Path(__file__).parent / "templates"
 

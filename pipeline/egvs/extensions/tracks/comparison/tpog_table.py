@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
 from egvs.core.wording import format_percent
-from egvs.studies.tpog_page import format_bit, format_measured, format_share, format_speed
+from egvs.extensions.tracks.comparison.tpog_page import format_bit, format_measured, format_share, format_speed
 
 FULLY_COVERED = 0.95
 """A smaller covered share of the lanes is reported."""
 
 if TYPE_CHECKING:
-    from egvs.studies.tpog_comparison import LaneComparison, TpogComparison
+    from egvs.extensions.tracks.comparison.tpog_comparison import LaneComparison, TpogComparison
 
 
 def print_tpog_comparison(comparison: TpogComparison, page: Path, top: int | None = None) -> None:

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from egvs.kernels import range_segments
-from egvs.kernels.range_segments import BY_AREA, BY_VARIANCE, MAX_SEARCHED, SUMMARY
+from egvs.extensions.validation.kernels import range_segments
+from egvs.extensions.validation.kernels.range_segments import BY_AREA, BY_VARIANCE, MAX_SEARCHED, SUMMARY
 
 HEADINGS = 90
 TURN = np.arange(HEADINGS) * (math.pi / 2 / HEADINGS)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egvs.core.files import add_checksum, has_valid_checksum
+from egvs.artefacts.checksums import add_checksum, has_valid_checksum
 
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**20), 10**20) | st.floats() | st.text(st.characters(codec="utf-8")),

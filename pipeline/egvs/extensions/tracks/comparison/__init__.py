@@ -1,0 +1,1 @@
+"""Recorded traffic compared with simulated traffic, for ``egvs compare --tpog``."""

@@ -1,0 +1,1 @@
+"""Compiled loops of the detectors and of their metrics; compiled as those of :mod:`egvs.kernels`."""
