@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import egvs
+from egvs.artefacts import checksums
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.placement import plan
@@ -208,7 +209,7 @@ def forge(folder: Path, name: str, source: Path) -> None:
     for stage in record["stages"].values():
         if name in stage["artefacts"]:
             stage["artefacts"][name] = files.hash_file(folder / name)
-    (folder / "run.json").write_text(files.to_json_text(files.add_checksum(record)))
+    (folder / "run.json").write_text(files.to_json_text(checksums.add_checksum(record)))
 
 
 @pytest.mark.parametrize("name", ["scores.parquet", "scans.parquet"])
