@@ -15,6 +15,8 @@ MAX_RINGS = 10_000
 _OPTICS_KEYS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity", "range_sigma_m")
 _FIELD_OF_VIEW_KEYS = ("azimuth_deg", "beams", "pattern")
 _RING_KEYS = ("channels", "azimuth_offsets_deg", "azimuth_step_deg", "azimuth_deg")
+_FILE_RING_KEYS = ("azimuth_step_deg", "azimuth_deg")
+"""They complete a file of rings; :mod:`egvs.sensors.sensor` refuses them with other files."""
 
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Azimuth = Annotated[float, Field(ge=-360, le=360)]
@@ -65,7 +67,9 @@ class SensorConfig(StrictModel):
         None, description="First and last azimuth of a ring, counter-clockwise from x. By default the full circle"
     )
     beams: str | None = Field(
-        None, description="Instead of rings: a CSV file of beams with the columns elevation_deg, azimuth_deg"
+        None,
+        description="A file of beams or rings: a table (CSV), an Ouster's metadata (JSON), angles of Hesai or RoboSense"
+        " (CSV)",
     )
     pattern: BeamPatternConfig | None = None
     range_m: Positive = Field(description="Maximum range")
@@ -121,7 +125,10 @@ class SensorConfig(StrictModel):
             if self.azimuth_step_deg is None:
                 raise ValueError("elevations_deg needs azimuth_step_deg")
             return self
-        unused = [key for key in _RING_KEYS if getattr(self, key)]
+        if self.azimuth_deg is not None and self.azimuth_step_deg is None:
+            raise ValueError("azimuth_deg needs azimuth_step_deg")
+        completing = _FILE_RING_KEYS if sources == ["beams"] else ()
+        unused = [key for key in _RING_KEYS if getattr(self, key) and key not in completing]
         if unused:
             raise ValueError(f"no effect with {sources[0]}: {', '.join(unused)}")
         return self

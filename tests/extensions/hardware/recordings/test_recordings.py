@@ -120,7 +120,8 @@ def message(dtype: np.dtype, rows: int, padding: int, **values: FloatArray) -> S
 def test_decodes_any_layout_of_points(order: str) -> None:
     """Fields out of order with gaps, padded rows, either byte order; integers of time are nanoseconds."""
     dtype = np.dtype(
-        {"names": ["z", "t", "x", "y", "ring"], "formats": [f"{order}{kind}" for kind in ("f8", "u4", "f8", "f8", "u2")],
+        {"names": ["z", "t", "x", "y", "ring"],
+         "formats": [f"{order}{kind}" for kind in ("f8", "u4", "f8", "f8", "u2")],
          "offsets": [4, 12, 20, 28, 36], "itemsize": 40}
     )  # fmt: skip
     x, y = np.array([1.0, 2.0, np.nan, 4.0]), np.array([5.0, 6.0, np.nan, 8.0])
