@@ -36,7 +36,8 @@ from egvs.world.static_world import GROUND_MARGIN_M
 BEAMS = {
     "VLP-16": 28_800, "VLP-32C": 57_600, "Pandar XT-32": 64_000, "OS1-64": 65_536, "OS1-128": 131_072,
     "AT128": 153_600, "Pandar128": 230_400, "RS-Ruby Plus": 230_400, "RS-M1": 75_000, "OS0-128": 131_072,
-    "Livox Tele-15": 24_000, "Livox HAP": 45_200,
+    "Livox Tele-15": 24_000, "Livox HAP": 45_200, "Pandar64": 115_200, "RS-Ruby 80": 144_000, "OS1-64 BH": 65_536,
+    "OS1-128 BH": 131_072, "OS1-64 BH 2048": 131_072, "OS1-64 2048": 131_072, "OS1-128 2048": 262_144,
 }  # fmt: skip
 ALL_ROUND = [name for name, sensor in CATALOGUE.items() if sensor.azimuth_span_deg is None]
 LENGTH = 1e-15
@@ -119,7 +120,7 @@ class TestCatalogue:
         sensor = CATALOGUE[name]
         # Azimuths are rounded to 1e-6 degree; of these tables only Ouster's step, 0.3515625 degrees, and the
         # Pandar128's offsets are no multiples of that.
-        exact = 10**6 * 360 % max(sensor.azimuths, 1) == 0 and name != "Pandar128"
+        exact = 10**6 * 360 % max(sensor.azimuths, 1) == 0 and not name.startswith("Pandar")
         for yaw in (90.0, 45.0, 30.5, 123.456, -77.7):
             turned = sensor.directions() @ rotation_world_sensor(yaw, 0.0, 0.0).T
             assert np.abs(sensor.directions(yaw) - turned).max() < (1e-15 if exact else np.radians(1e-6))
