@@ -1,7 +1,7 @@
 """Train the model of the detector ``range_image`` on simulated sweeps of the training junctions.
 
 ``python -m benchmarks.range_image_model`` writes ``pipeline/egvs/extensions/validation/detectors/range_image.json``:
-ingolstadt, hill and roundabout, twelve sensors of the catalogue, random poses, and traffic with a seed that nothing else
+ingolstadt, hill and roundabout, twelve sensors, random poses, and traffic with a seed that nothing else
 uses. The same seed gives the same file. It takes some five minutes on one core. ``--out`` writes elsewhere,
 ``--junction`` trains on some of the junctions: ``--junction hill,roundabout`` for a test at ingolstadt.
 

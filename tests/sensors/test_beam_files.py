@@ -10,16 +10,25 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import egvs
+from egvs.artefacts.tpog import read_tpog
+from egvs.clouds.simulation import CloudSimulator, sweep_rng
 from egvs.core.errors import InputError
+from egvs.runs.run_context import open_folder
 from egvs.scenario.sensor_config import SensorConfig
+from egvs.scoring.scorer import Scorer
 from egvs.sensors import sites
-from egvs.sensors.beam_files import BeamTable, Rings, read_beam_file
-from egvs.sensors.sensor import Sensor, resolve_sensor
+from egvs.sensors.beam_files import BeamTable, Rings, read_beam_file, read_directions
+from egvs.sensors.sensor import Sensor, resolve_sensor, scenario_sensor
+from egvs.sensors.sites import Pose
 from egvs.stages import scene_checks
 from egvs.stages.inputs import CheckInputs
+from egvs.stages.site_scans import empty_scans
+from tests.clouds.cloud_scenes import frame_of
 
 ELEVATIONS_DEG, CLOCKWISE_DEG = [15.0, 1.5, -0.25, -25.0], [3.1, 1.0, -1.1, -3.2]
 
@@ -112,6 +121,8 @@ HESAI = "Laser id,Elevation,Azimuth\n1,14.436,3.257\n2,-6.5,-1.1\n"
     [
         (HESAI, "Hesai angles", HESAI_RINGS),
         (HESAI.replace("Laser id", "channel").replace("\n2", "\n\n2"), "Hesai angles", HESAI_RINGS),
+        (f"EEFF,1,1\n{HESAI}{'ab12' * 16},,\n", "Hesai angles", HESAI_RINGS),
+        (f"{HESAI}{'ab12' * 16}\n", "Hesai angles", HESAI_RINGS),
         ("15.0,-3.5\n-7.25,2.0\n", "RoboSense angles", Rings((15.0, -7.25), (3.5, -2.0))),
         ("elevation_deg,azimuth_offset_deg\n1,2\n-3,0\n", "table of rings", Rings((1.0, -3.0), (2.0, 0.0))),
         (
@@ -225,6 +236,7 @@ def test_rejects_wrong_metadata(tmp_path: Path, content: Any, message: str) -> N
         ("elevation_deg,azimuth_offset_deg,vertical_offset_m\n1,2,36\n", "vertical_offset_m: expected .* got '36'"),
         ("elevation_deg,azimuth_offset_deg\n" + "1,2\n" * 10_001, "at most 10,000 rings"),
         ("Laser id,Elevation,Azimuth\n1,2,3\n1,4,5\n", "ring 1: laser '1' is that of ring 0 too"),
+        (f"Laser id,Elevation,Azimuth\n{'ab12' * 16},,\n", "at least one ring"),
         ("Laser id,Elevation,Azimuth\n1,2,inf\n", "ring 0: Azimuth: expected"),
         ("1.5,2\n3,x\n", "ring 1: horizontal: expected a number"),
         ("1.5,2\n95,0\n", "ring 1: vertical: expected a number between -90 and 90"),
@@ -274,3 +286,102 @@ def test_prints_what_is_read(tmp_path: Path, run_egvs: Any) -> None:
     code, _, error = run_egvs("sensors", str(tmp_path / "absent.json"))
     assert code == 2
     assert "absent.json" in error
+
+
+# ---- directions with dwell times
+
+
+def write_directions(mini: Path, rows: str, samples: int) -> None:
+    """Give the small sensor of the scenario a pattern of directions."""
+    write(mini, "directions.csv", f"elevation_deg,azimuth_deg,dwell_s\n{rows}")
+    file = mini / "scenario.toml"
+    text = file.read_text(encoding="utf-8")
+    head, _, rest = text.partition("elevations_deg = [-15, 5]\nchannels = 8\nazimuth_step_deg = 1.0\n")
+    pattern = f'pattern = {{kind = "file", file = "directions.csv", samples = {samples}}}\n'
+    file.write_text(f"{head}{pattern}{rest}", encoding="utf-8")
+
+
+def test_directions_get_their_share_of_the_pulses(tmp_path: Path) -> None:
+    """Ten pulses, dwell times 1 : 4 : 5: one, four and five of them, each of the last two as several beams."""
+    path = write(tmp_path, "d.csv", "elevation_deg,azimuth_deg,dwell_s\n1,2,0.05\n-3,4,0.2\n5,6,0.25\n")
+    table = read_directions(path, 10)
+    assert table.elevation_deg.tolist() == [1.0] + [-3.0] * 4 + [5.0] * 5
+    assert table.weight is not None
+    assert table.weight == pytest.approx(np.ones(10))
+    few = read_directions(path, 2)
+    assert few.weight == pytest.approx([0.2, 0.8, 1.0])
+    assert few != table
+    with pytest.raises(InputError, match="beams"):
+        read_directions(path, 10_000_000)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("elevation_deg,azimuth_deg\n1,2\n", "expected a column dwell_s, got a table of beams"),
+        ("elevation_deg,azimuth_offset_deg\n1,2\n", "expected a column dwell_s, got a table of rings"),
+        ("elevation_deg,azimuth_deg,dwell_s\n1,2,0\n", "beam 0: dwell_s: expected seconds above 0, got 0"),
+        ("elevation_deg,azimuth_deg,dwell_s\n1,2,-1\n", "beam 0: dwell_s: expected seconds above 0, got -1"),
+        ("elevation_deg,azimuth_deg,dwell_s\n1,2,1e9\n", "beam 0: dwell_s: expected a number between"),
+        ("elevation_deg,azimuth_deg,dwell_s\n1,2\n", "beam 0: dwell_s: expected a number .* got ''"),
+    ],
+)
+def test_rejects_wrong_directions(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_directions(write(tmp_path, "d.csv", text), 100)
+
+
+def test_dwell_times_count_only_in_a_pattern(tmp_path: Path) -> None:
+    path = write(tmp_path, "d.csv", "elevation_deg,azimuth_deg,dwell_s\n1,2,1\n")
+    config = SensorConfig.from_dict({"beams": str(path), "range_m": 9})
+    with pytest.raises(InputError, match=r"sensors\.u\.beams: d\.csv has dwell times"):
+        resolve_sensor("u", {"u": config}, "here")
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        {"kind": "file", "samples": 9},
+        {"kind": "even", "samples": 9, "file": "d.csv", "azimuth_deg": (-1, 1), "elevation_deg": (-1, 1)},
+        {"kind": "file", "samples": 9, "file": "d.csv", "azimuth_deg": (-1, 1)},
+        {"kind": "even", "samples": 9, "azimuth_deg": (-1, 1)},
+    ],
+)
+def test_rejects_contradictory_patterns(pattern: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="must be set for"):
+        SensorConfig.from_dict({"range_m": 9, "pattern": pattern})
+
+
+def test_expected_hits_are_proportional_to_the_dwell_time(mini: Path, tmp_path: Path) -> None:
+    """Equal dwell times and a pulse for each direction are the table itself; with half the pulses, half the hits."""
+    small = scenario_sensor("small", egvs.load(mini), "here")
+    angles = [f"{el},{az}" for az in range(small.azimuths) for el in small.elevations_deg]
+    plain = hits_at_sites(mini, tmp_path / "plain")
+    write_directions(mini, "".join(f"{row},0.01\n" for row in angles), len(angles))
+    np.testing.assert_allclose(hits_at_sites(mini, tmp_path / "all"), plain, rtol=1e-6)
+    file = mini / "scenario.toml"
+    text = file.read_text(encoding="utf-8")
+    file.write_text(text.replace(f"samples = {len(angles)}", f"samples = {len(angles) // 2}"), encoding="utf-8")
+    np.testing.assert_allclose(hits_at_sites(mini, tmp_path / "half"), 0.5 * plain, rtol=1e-6)
+    assert scenario_sensor("small", egvs.load(mini), "here").pulses == len(angles) // 2
+
+
+def hits_at_sites(folder: Path, out: Path) -> NDArray[np.float64]:
+    """Return the expected hits of all voxels at the sites of a run, (sites, voxels)."""
+    scenario = egvs.load(folder)
+    egvs.run(scenario, out)
+    context = open_folder(scenario, out)
+    tpog = read_tpog(out / "tpog.parquet")
+    scorer = Scorer(context.scene, tpog, out / "trajectories.parquet")
+    return np.array([scorer.hits(scan.beams).ravel() for scan in empty_scans(context)], dtype=np.float64)
+
+
+def test_clouds_draw_the_pulses_of_a_frame(mini: Path) -> None:
+    """1,440 directions that meet the ground, with a chance of a quarter each: 360 pulses on average."""
+    angles = [f"{el},{az}" for az in range(360) for el in (-10.0, -20.0, -30.0, -40.0)]
+    write_directions(mini, "".join(f"{row},2.5\n" for row in angles), len(angles) // 4)
+    scene = egvs.build_scene(egvs.load(mini))
+    simulator = CloudSimulator(scene, Pose(10.0, 12.0, 5.0), scene.sensor("small"), "here")
+    returns = [len(simulator.sweep(frame_of([]), sweep_rng(1, "here", number)).sweep.beam) for number in range(40)]
+    assert np.mean(returns) == pytest.approx(360, abs=4 * math.sqrt(1440 * 0.25 * 0.75 / 40))
+    assert len(set(returns)) > 10

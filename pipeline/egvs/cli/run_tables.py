@@ -350,7 +350,7 @@ def print_sensor_details(sensors: Iterable[Sensor]) -> None:
         divergence_mrad = " x ".join(f"{angle:g}" for angle in sensor.divergence_mrad)
         lines = [
             sensor.name,
-            f"  beams: {sensor.beams} of one turn or frame; {rings}{step}",
+            f"  beams: {sensor.pulses} of one turn or frame; {rings}{step}",
             f"  view: azimuth {_format_azimuths(sensor)} deg, elevation {_format_elevations(sensor)} deg",
             f"  range: {sensor.range_m:g} m; rated: {_format_rating(sensor, ' m')}",
             f"  laser: {sensor.wavelength_nm:g} nm, divergence {divergence_mrad} mrad, range noise "
@@ -396,6 +396,8 @@ def print_beam_file(path: Path, file: BeamFile) -> None:
             lines.append(f"  vertical offsets {_format_span(offsets_mm, 'mm')} (not simulated)")
     lines.append(f"  elevations {_format_span(elevations)}: {_first_values(elevations)}")
     keys = f'beams = "{path.name}", range_m = METRES'
+    if file.dwell_s is not None:
+        keys = f'range_m = METRES, pattern = {{kind = "file", file = "{path.name}", samples = PULSES OF A FRAME}}'
     if not isinstance(beams, BeamTable) and beams.azimuths is None:
         keys += ", azimuth_step_deg = DEGREES"
     lines.append(f"  in a scenario: [sensors.NAME] with {keys}")

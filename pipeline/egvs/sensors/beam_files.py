@@ -2,10 +2,11 @@ r"""Files that state the beams of a sensor: tables of beams or rings, and the ma
 
 ============================  =========================================================================================
 Table of beams (CSV)          columns ``elevation_deg``, ``azimuth_deg``; one row per beam
+Table of directions (CSV)     columns ``elevation_deg``, ``azimuth_deg``, ``dwell_s``; for patterns that do not repeat
 Table of rings (CSV)          columns ``elevation_deg``, ``azimuth_offset_deg`` and, optionally, ``vertical_offset_m``;
                               one row per ring
-Hesai, angle correction       columns ``Laser id`` (or ``Channel``), ``Elevation``, ``Azimuth``; azimuths clockwise
-(CSV)
+Hesai, angle correction       columns ``Laser id`` (or ``Channel``), ``Elevation``, ``Azimuth``; azimuths clockwise;
+(CSV)                         often a line ``EEFF,...`` before, and a checksum after
 RoboSense, ``angle.csv``      no header; two columns: vertical and horizontal angle; horizontal angles clockwise
 Ouster, metadata (JSON)       ``beam_altitude_angles``, ``beam_azimuth_angles`` (clockwise), columns per frame; keys of
                               firmware 1 and 2 at the top level, of later ones in ``beam_intrinsics``,
@@ -44,11 +45,12 @@ from egvs.core.reading import read_json
 from egvs.scenario.sensor_config import MAX_RINGS
 
 BEAM_COLUMNS = ("elevation_deg", "azimuth_deg")
-RING_COLUMN, HEIGHT_COLUMN = "azimuth_offset_deg", "vertical_offset_m"
+RING_COLUMN, HEIGHT_COLUMN, DWELL_COLUMN = "azimuth_offset_deg", "vertical_offset_m", "dwell_s"
 
 MAX_ELEVATION_DEG, MAX_AZIMUTH_DEG = 90.0, 360.0
 MAX_OFFSET_M = 1.0
 """Optics of a sensor are no farther from its origin."""
+MAX_DWELL_S = 1e6
 MAX_COLUMNS = 100_000
 """Columns of a turn: fifty times as many as any sensor has."""
 
@@ -57,10 +59,14 @@ _GAP_DEG = 5.0
 _GAP_TOLERANCE_DEG = 1e-6
 """Gaps whose widths differ by less are equally wide."""
 
+_HESAI_MARK, _CHECKSUM = "eeff", re.compile(r"[0-9a-fA-F]{32,128}")
 _MODE = re.compile(r"(\d{1,6})x(\d{1,3})")
 _CSV_HINT = (
     "The header needs the columns elevation_deg, azimuth_deg (a row per beam) or elevation_deg, azimuth_offset_deg (a"
     " row per ring), separated by commas."
+)
+_DWELL_HINT = (
+    "List each direction once, with the seconds that the beam pointed there: elevation_deg,azimuth_deg,dwell_s."
 )
 _OUSTER_HINT = "Save it again with the maker's tools, for example from http://SENSOR/api/v1/sensor/metadata."
 
@@ -68,20 +74,24 @@ _OUSTER_HINT = "Save it again with the maker's tools, for example from http://SE
 class BeamTable:
     """Elevation and azimuth of each beam in the sensor frame, degrees; immutable and hashable.
 
-    Two tables are equal if their angles are equal.
+    Two tables are equal if their angles and weights are equal.
 
     Parameters
     ----------
     elevation_deg, azimuth_deg
         One value per beam, (n,) float64 each, n > 0.
+    weight
+        Probability that a frame has this beam, (n,) float64, above 0 and at most 1; None if each frame has all beams.
     """
 
-    def __init__(self, elevation_deg: FloatArray, azimuth_deg: FloatArray) -> None:
+    def __init__(self, elevation_deg: FloatArray, azimuth_deg: FloatArray, weight: FloatArray | None = None) -> None:
         self.elevation_deg = np.array(elevation_deg, dtype=np.float64)
         self.azimuth_deg = np.array(azimuth_deg, dtype=np.float64)
-        self.elevation_deg.flags.writeable = False
-        self.azimuth_deg.flags.writeable = False
-        self._digest = hashlib.sha256(self.elevation_deg.tobytes() + self.azimuth_deg.tobytes()).digest()
+        self.weight = None if weight is None else np.array(weight, dtype=np.float64)
+        columns = [column for column in (self.elevation_deg, self.azimuth_deg, self.weight) if column is not None]
+        for column in columns:
+            column.flags.writeable = False
+        self._digest = hashlib.sha256(b"".join(column.tobytes() for column in columns)).digest()
 
     def __len__(self) -> int:
         return len(self.elevation_deg)
@@ -147,10 +157,13 @@ class BeamFile:
         The format, in words.
     beams
         Single beams or rings.
+    dwell_s
+        How long the beam of a pattern pointed into each direction, (n,) float64; None for other files.
     """
 
     kind: str
     beams: BeamTable | Rings
+    dwell_s: FloatArray | None = None
 
 
 def is_beam_file(name: str) -> bool:
@@ -178,6 +191,35 @@ def read_beam_file(path: Path) -> BeamFile:
     return _read_cached(path, hash_input(path))
 
 
+def read_directions(path: Path, pulses: int) -> BeamTable:
+    """Read the directions of a sensor whose pattern does not repeat, with their dwell times.
+
+    Of the ``pulses`` of a frame, each direction gets its share of the dwell time on average. A direction with more than
+    one is listed several times, so that every weight is at most 1.
+
+    Parameters
+    ----------
+    path
+        A CSV file with the columns ``elevation_deg``, ``azimuth_deg`` and ``dwell_s``: how long the beam pointed there,
+        over any time, seconds.
+    pulses
+        Pulses of one frame.
+
+    Raises
+    ------
+    InputError
+        Naming file, row and value.
+    """
+    file = read_beam_file(path)
+    if not isinstance(file.beams, BeamTable) or file.dwell_s is None:
+        raise InputError(path, f"expected a column {DWELL_COLUMN}, got a {file.kind}", _DWELL_HINT)
+    expected = pulses * file.dwell_s / file.dwell_s.sum()
+    copies = np.ceil(expected).astype(np.int64)
+    limits.BEAMS.check(path, int(copies.sum()))
+    columns = (file.beams.elevation_deg, file.beams.azimuth_deg, expected / copies)
+    return BeamTable(*(np.repeat(column, copies) for column in columns))
+
+
 @lru_cache(maxsize=4)
 def _read_cached(path: Path, _content_hash: str) -> BeamFile:
     limits.checked_size(path, limits.FILE)
@@ -196,6 +238,8 @@ def _read_cached(path: Path, _content_hash: str) -> BeamFile:
 
 def _read_csv(path: Path, rows: Any) -> BeamFile:
     header = next(rows, [])
+    if header and header[0].strip().lower() == _HESAI_MARK:
+        header = next(rows, [])
     names = [name.strip() for name in header]
     lower = [name.lower() for name in names]
     if len(names) == 2 and all(_is_number(name) for name in names):
@@ -204,7 +248,9 @@ def _read_csv(path: Path, rows: Any) -> BeamFile:
     if {"elevation", "azimuth"} <= set(lower):
         _check_columns(path, lower, ("elevation", "azimuth"))
         columns = (lower.index("elevation"), lower.index("azimuth"))
-        listed = list(itertools.islice(rows, MAX_RINGS + 1))
+        listed = [row for row in itertools.islice(rows, MAX_RINGS + 2) if row]
+        if listed and _is_checksum(listed[-1]):
+            listed.pop()
         for name in set(lower) & {"laser id", "channel"}:
             _check_lasers(path, listed, lower.index(name))
         return BeamFile("Hesai angles", _rings(path, listed, ("Elevation", "Azimuth"), columns, -1.0, len(names)))
@@ -216,8 +262,19 @@ def _read_csv(path: Path, rows: Any) -> BeamFile:
         _check_columns(path, names, read)
         columns = tuple(names.index(name) for name in read)
         return BeamFile("table of rings", _rings(path, rows, read, columns, 1.0, len(names)))
-    _check_columns(path, names, BEAM_COLUMNS)
-    return BeamFile("table of beams", _beams(path, rows, names))
+    has_dwell = DWELL_COLUMN in names
+    columns = (*BEAM_COLUMNS, DWELL_COLUMN) if has_dwell else BEAM_COLUMNS
+    _check_columns(path, names, columns)
+    table = _beams(path, rows, names, columns)
+    beams = BeamTable(table[:, 0], table[:, 1])
+    if has_dwell:
+        return BeamFile("table of directions", beams, table[:, 2])
+    return BeamFile("table of beams", beams)
+
+
+def _is_checksum(row: list[str]) -> bool:
+    """Whether a row is the checksum at the end of a Hesai file: hexadecimal digits, and nothing else."""
+    return _CHECKSUM.fullmatch(row[0].strip()) is not None and not any(cell.strip() for cell in row[1:])
 
 
 def _is_number(text: str) -> bool:
@@ -232,24 +289,27 @@ def _check_columns(path: Path, names: Sequence[str], read: Sequence[str]) -> Non
             raise InputError(path, f"the file has {names.count(column)} columns {column}", _CSV_HINT)
 
 
-def _beams(path: Path, rows: Any, names: list[str]) -> BeamTable:
-    columns = [names.index(name) for name in BEAM_COLUMNS]
-    angles: list[tuple[float, float]] = []
+def _beams(path: Path, rows: Iterable[list[str]], names: list[str], read: Sequence[str]) -> FloatArray:
+    """Return columns of a table with a row per beam, (n, columns)."""
+    columns = [names.index(name) for name in read]
+    values: list[list[float]] = []
     maximum = limits.BEAMS.maximum
     for row in rows:
         if not row:
             continue
-        where = f"{path}: beam {len(angles)}"
+        where = f"{path}: beam {len(values)}"
         _check_width(where, row, len(names))
-        elevation_deg = _parse(f"{where}: elevation_deg", _cell(row, columns[0]), MAX_ELEVATION_DEG)
-        azimuth_deg = _parse(f"{where}: azimuth_deg", _cell(row, columns[1]), MAX_AZIMUTH_DEG)
-        angles.append((elevation_deg, azimuth_deg))
-        if len(angles) > maximum:
+        cells = zip(read, columns, (MAX_ELEVATION_DEG, MAX_AZIMUTH_DEG, MAX_DWELL_S), strict=False)
+        values.append([_parse(f"{where}: {name}", _cell(row, column), bound) for name, column, bound in cells])
+        if len(read) > len(BEAM_COLUMNS) and values[-1][2] <= 0.0:
+            raise InputError(
+                f"{where}: {DWELL_COLUMN}", f"expected seconds above 0, got {values[-1][2]:g}", _DWELL_HINT
+            )
+        if len(values) > maximum:
             raise InputError(path, f"the file has more than {maximum:,} beams", limits.BEAMS.hint)
-    if not angles:
+    if not values:
         raise InputError(path, "expected at least one beam, got none", "Write one row per beam.")
-    table = np.array(angles)
-    return BeamTable(table[:, 0], table[:, 1])
+    return np.array(values)
 
 
 def _rings(
@@ -285,7 +345,7 @@ def _check_ring_count(where: object, count: int) -> None:
 def _check_lasers(path: Path, rows: list[list[str]], column: int) -> None:
     """Check that no laser is listed twice."""
     first: dict[str, int] = {}
-    for number, row in enumerate(row for row in rows if row):
+    for number, row in enumerate(rows):
         laser = _cell(row, column).strip()
         if laser in first:
             problem = f"laser {laser[:20]!r} is that of ring {first[laser]} too"

@@ -39,7 +39,7 @@ from egvs.core.grid import FloatArray
 from egvs.core.special import cosdg, sindg
 from egvs.scenario.model import Scenario
 from egvs.scenario.sensor_config import BeamPatternConfig, SensorConfig
-from egvs.sensors.beam_files import BeamTable, read_beam_file
+from egvs.sensors.beam_files import BeamTable, read_beam_file, read_directions
 
 FEW_BEAMS = 1000
 """A LiDAR has more beams in a turn or frame; with fewer, a file of rings was probably read as one of single beams."""
@@ -64,9 +64,9 @@ def repeated_beams(table: BeamTable) -> list[tuple[int, int]]:
 
 def describe_few_beams(sensor: Sensor) -> str | None:
     """Return a sentence if a sensor has fewer than :data:`FEW_BEAMS` beams; None otherwise."""
-    if sensor.beams >= FEW_BEAMS:
+    if sensor.pulses >= FEW_BEAMS:
         return None
-    return f"{sensor.name} has {sensor.beams:,} beams in a turn or frame; a LiDAR has thousands"
+    return f"{sensor.name} has {sensor.pulses:,} beams in a turn or frame; a LiDAR has thousands"
 
 
 FEW_BEAMS_HINT = (
@@ -75,7 +75,7 @@ FEW_BEAMS_HINT = (
 )
 
 
-def beams_from_pattern(pattern: BeamPatternConfig) -> BeamTable:
+def beams_from_pattern(pattern: BeamPatternConfig, find: Callable[[str], Path] = Path) -> BeamTable:
     r"""Return one frame of a sensor whose scan pattern does not repeat.
 
     With :math:`n` beams, and :math:`u, v` from 0 to 1 across the field of view in azimuth and elevation:
@@ -84,10 +84,17 @@ def beams_from_pattern(pattern: BeamPatternConfig) -> BeamTable:
       beam along :math:`2u - 1 = (\cos 2\pi p t + \cos 2\pi q t) / 2`,
       :math:`2v - 1 = (\sin 2\pi p t + \sin 2\pi q t) / 2`, with :math:`t = (k + 1/2) / n` (a Risley pair at small
       angles: Marshall 1999, Risley prism scan patterns, Proc. SPIE 3787);
-    - *even*: :math:`u = (k + 1/2) / n`, :math:`v = frac(1/2 + k (\sqrt 5 - 1) / 2)`, a Kronecker lattice.
+    - *even*: :math:`u = (k + 1/2) / n`, :math:`v = frac(1/2 + k (\sqrt 5 - 1) / 2)`, a Kronecker lattice;
+    - *file*: the directions of a CSV file, each with the probability that a frame has a pulse there: the number of
+      pulses times its share of the dwell time (:func:`egvs.sensors.beam_files.read_directions`). Scores count expected
+      hits; a simulated point cloud draws the pulses of its frame.
 
-    Angles are rounded to 1e-6 degree.
+    Angles of formulas are rounded to 1e-6 degree. ``find`` finds the file.
     """
+    if pattern.file is not None:
+        return read_directions(find(pattern.file), pattern.samples)
+    assert pattern.elevation_deg is not None
+    assert pattern.azimuth_deg is not None
     k = np.arange(pattern.samples)
     if pattern.turns is not None:
         first_prism, second_prism = (
@@ -169,6 +176,16 @@ class Sensor:
         if self.table is not None:
             return len(self.table)
         return self.channels * self.azimuths
+
+    @property
+    def beam_weight(self) -> FloatArray | None:
+        """Probability that a frame has each beam, (beams,) float64; None if each frame has all."""
+        return None if self.table is None else self.table.weight
+
+    @property
+    def pulses(self) -> int:
+        """Number of pulses of one turn or frame; of a sensor with dwell times fewer than its beams."""
+        return self.beams if self.beam_weight is None else round(float(self.beam_weight.sum()))
 
     @property
     def elevation_span_deg(self) -> tuple[float, float]:
@@ -304,7 +321,9 @@ def scenario_sensor(name: str, scenario: Scenario, where: str) -> Sensor:
     Messages name the key of ``[sites]`` that sets this sensor, if there is one, in place of ``where``.
     """
     where = _sites_key(name, scenario) or where
-    return resolve_sensor(name, scenario.sensors, where, lambda file: scenario.find(file, f"sensors.{name}.beams"))
+    config = scenario.sensors.get(name)
+    key = config.beam_file[0] if config is not None and config.beam_file is not None else "beams"
+    return resolve_sensor(name, scenario.sensors, where, lambda file: scenario.find(file, f"sensors.{name}.{key}"))
 
 
 def _sites_key(name: str, scenario: Scenario) -> str:
@@ -383,6 +402,10 @@ def _sensor_from_file(name: str, config: SensorConfig, source: str, path: Path) 
     where = f"sensors.{name}"
     keys = [key for key in ("azimuth_step_deg", "azimuth_deg") if getattr(config, key) is not None]
     if isinstance(beams, BeamTable):
+        if read_beam_file(path).dwell_s is not None:
+            problem = f"{path.name} has dwell times, which count only in a pattern"
+            hint = f'Use [sensors.{name}.pattern] with kind = "file", file = "{path.name}", samples = PULSES.'
+            raise InputError(f"{where}.beams", problem, hint)
         if keys:
             problem = f"no effect with {path.name}, which lists single beams"
             raise InputError(f"{where}.{keys[0]}", problem, "Omit it, or give a file with a row per ring.")
@@ -415,7 +438,7 @@ def _sensor_from_config(name: str, config: SensorConfig, source: str, find: Call
     if config.beams is not None:
         return _sensor_from_file(name, config, source, find(config.beams))
     if config.pattern is not None:
-        table = beams_from_pattern(config.pattern)
+        table = beams_from_pattern(config.pattern, find)
     elif config.channels not in (None, len(elevations)):
         first, last = elevations
         elevations = tuple(np.round(np.linspace(first, last, config.rings), 9).tolist())

@@ -141,7 +141,8 @@ def warn_few_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
             continue  # check_sensors_known reports it
         if problem is not None:
             config = scenario.sensors.get(name)
-            where = config.beams if config is not None and config.beams is not None else f"sensors.{name}"
+            file = None if config is None else config.beam_file
+            where = f"sensors.{name}" if file is None else file[1]
             yield Diagnostic("few beams", where, problem, sensor.FEW_BEAMS_HINT)
 
 
