@@ -14,8 +14,9 @@ Features of a point: x, y from the centre of its pillar, height, :data:`INTENSIT
 pillar's points, whether it is foreground, and its range as a share of 50 m.
 
 **Intensity** is not used. Simulated intensities are those of ideal surfaces, which no real sensor reports, and a
-network that sees them depends on them: with 0.5 for all points, the shipped model loses 26 points of AP. Its channel is
-therefore fed one constant, at detection and at training.
+network that sees them depends on them: with 1 for all points, the shipped model loses 25 points of AP. Its channel is
+therefore fed one constant, at detection and at training. With the constant, the shipped model, which was trained with
+simulated intensities, has the AP that it had with them (docs/validation.md).
 
 **Maps.** For each cell, the network returns the log odds that the centre of a vehicle is there, and the values of a
 box: its centre relative to that of the cell, its height, its size, and twice its heading (a box looks the same from
@@ -63,9 +64,8 @@ POINTS_PER_PILLAR = 16
 N_FEATURES = 9
 
 INTENSITY = 0.17
-"""Stands for the intensity of every point: that of asphalt, near which most points of the shipped model's training
-were. Of the constants that ``python -m benchmarks.intensity`` tries at training junctions, none is better by more than
-its standard error."""
+"""Stands for the intensity of every point: that of asphalt. Of the constants that ``python -m benchmarks.intensity``
+tries at the training junctions, it has the highest AP."""
 
 STRIDE = 2
 """Pillars along each side of a cell of the network's maps."""
