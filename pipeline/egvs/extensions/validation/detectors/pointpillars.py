@@ -375,8 +375,9 @@ class PointPillars:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The sha256 of the model, and the intensity that it is fed."""
-        return {"model": files.hash_file(self.model), "intensity": self.intensity}
+        """The sha256 of the model, and the intensity that it is fed if it is not that of each point."""
+        fed = {} if self.intensity is None else {"intensity": self.intensity}
+        return {"model": files.hash_file(self.model), **fed}
 
     def at_site(self, view: SiteView, roi: Roi) -> AtOneSite[_AtSites]:
         """Prepare the detector for one site."""
