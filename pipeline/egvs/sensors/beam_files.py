@@ -28,7 +28,7 @@ import hashlib
 import itertools
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -236,7 +236,7 @@ def _read_cached(path: Path, _content_hash: str) -> BeamFile:
 # ---- tables
 
 
-def _read_csv(path: Path, rows: Any) -> BeamFile:
+def _read_csv(path: Path, rows: Iterator[list[str]]) -> BeamFile:
     header = next(rows, [])
     if header and header[0].strip().lower() == _HESAI_MARK:
         header = next(rows, [])
@@ -247,21 +247,21 @@ def _read_csv(path: Path, rows: Any) -> BeamFile:
         return BeamFile("RoboSense angles", _rings(path, rows, ("vertical", "horizontal"), (0, 1), -1.0))
     if {"elevation", "azimuth"} <= set(lower):
         _check_columns(path, lower, ("elevation", "azimuth"))
-        columns = (lower.index("elevation"), lower.index("azimuth"))
+        angles = (lower.index("elevation"), lower.index("azimuth"))
         listed = [row for row in itertools.islice(rows, MAX_RINGS + 2) if row]
         if listed and _is_checksum(listed[-1]):
             listed.pop()
-        for name in set(lower) & {"laser id", "channel"}:
-            _check_lasers(path, listed, lower.index(name))
-        return BeamFile("Hesai angles", _rings(path, listed, ("Elevation", "Azimuth"), columns, -1.0, len(names)))
+        for name in ("laser id", "channel"):
+            if name in lower:
+                _check_lasers(path, listed, lower.index(name))
+        return BeamFile("Hesai angles", _rings(path, listed, ("Elevation", "Azimuth"), angles, -1.0, len(names)))
     if RING_COLUMN in names:
         if BEAM_COLUMNS[1] in names:
             problem = f"the file has both columns {BEAM_COLUMNS[1]} (of a beam) and {RING_COLUMN} (of a ring)"
             raise InputError(path, problem, _CSV_HINT)
         read = (BEAM_COLUMNS[0], RING_COLUMN, *((HEIGHT_COLUMN,) if HEIGHT_COLUMN in names else ()))
         _check_columns(path, names, read)
-        columns = tuple(names.index(name) for name in read)
-        return BeamFile("table of rings", _rings(path, rows, read, columns, 1.0, len(names)))
+        return BeamFile("table of rings", _rings(path, rows, read, list(map(names.index, read)), 1.0, len(names)))
     has_dwell = DWELL_COLUMN in names
     columns = (*BEAM_COLUMNS, DWELL_COLUMN) if has_dwell else BEAM_COLUMNS
     _check_columns(path, names, columns)

@@ -79,8 +79,11 @@ def read_calibrated_pose(path: Path, plane: GroundPlane) -> CalibratedPose:
     if cosine <= 0.0:
         problem = "expected a pose above the ground plane, got one below it"
         raise InputError(path, problem, "Give the transformation from the sensor's frame into the map, z upwards.")
+    x_m, y_m, z_m = position_m.tolist()
     pose = Pose(
-        *(float(value) for value in position_m),
+        x_m,
+        y_m,
+        z_m,
         yaw_deg=math.degrees(math.atan2(rotation[1, 0], rotation[0, 0])),
         pitch_deg=math.degrees(math.asin(np.clip(rotation[2, 0], -1.0, 1.0))),
         roll_deg=math.degrees(math.atan2(rotation[2, 1], rotation[2, 2])),
