@@ -167,7 +167,7 @@ def test_library_versions_are_those_installed() -> None:
 MOST_LINES = {
     "check": 15_000,
     "statics": 9_500,
-    "scan": 11_300,
+    "scan": 11_600,  # 300 of them read the files of beams that makers give
     "traffic": 9_800,
     "tpog": 4_000,
     "score": 16_000,
