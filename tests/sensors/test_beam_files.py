@@ -285,7 +285,7 @@ def test_prints_what_is_read(tmp_path: Path, run_egvs: Any) -> None:
     assert "VLP-16" in words
     code, _, error = run_egvs("sensors", str(tmp_path / "absent.json"))
     assert code == 2
-    assert "absent.json" in error
+    assert "absent.json: there is no such file. Check the path." in " ".join(error.split())
 
 
 # ---- directions with dwell times

@@ -3,8 +3,9 @@
 Steps of :func:`read_points`: find the format by the file's suffix; read the file; drop, and count, the points that are
 NaN or infinite, which mark missing returns. Incomplete files are rejected.
 
-The module of a format has a function ``read`` and may have ``write`` and ``crs_of`` (:class:`PointFormat`). The formats
-of this program are in :mod:`egvs.formats.readers`; other packages may add theirs (``docs/extending.md``).
+The module of a format has a function ``read`` and may have ``write``, ``crs_of``, ``stream`` and ``read_field``
+(:class:`PointFormat`). The formats of this program are in :mod:`egvs.formats.readers`; other packages may add theirs
+(``docs/extending.md``).
 
 Points are in the world frame (right-handed, x east, y north, z up), metres, float64, or in the coordinate reference
 system that the file declares (:func:`point_cloud_crs`).

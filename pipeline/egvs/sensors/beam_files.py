@@ -188,6 +188,8 @@ def read_beam_file(path: Path) -> BeamFile:
     InputError
         Naming file, row or key, and value.
     """
+    if not path.is_file():
+        raise InputError(path, "there is no such file", "Check the path.")
     return _read_cached(path, hash_input(path))
 
 

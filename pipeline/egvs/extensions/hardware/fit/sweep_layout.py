@@ -58,7 +58,10 @@ _FINEST_M = 1e-6
 _MAX_RESIDUAL_DEG = 0.05
 _MAX_STRAY_SHARE = 0.2
 
-_HINT = "Give complete sweeps of a sensor with rings, in the sensor's frame (z along the axis of rotation)."
+_HINT = (
+    "Give complete sweeps of a sensor with rings, in the sensor's frame (z along the axis of rotation). Patterns that"
+    " do not repeat (Livox) cannot be fitted; use pattern.file with directions and dwell times."
+)
 
 
 @dataclass(frozen=True)
