@@ -23,6 +23,7 @@ from egvs.scenario.sensor_config import SensorConfig
 from egvs.scoring.scorer import Scorer
 from egvs.sensors import sites
 from egvs.sensors.beam_files import BeamTable, Rings, read_beam_file, read_directions
+from egvs.sensors.scanner import Scanner
 from egvs.sensors.sensor import Sensor, resolve_sensor, scenario_sensor
 from egvs.sensors.sites import Pose
 from egvs.stages import scene_checks
@@ -364,6 +365,17 @@ def test_expected_hits_are_proportional_to_the_dwell_time(mini: Path, tmp_path: 
     file.write_text(text.replace(f"samples = {len(angles)}", f"samples = {len(angles) // 2}"), encoding="utf-8")
     np.testing.assert_allclose(hits_at_sites(mini, tmp_path / "half"), 0.5 * plain, rtol=1e-6)
     assert scenario_sensor("small", egvs.load(mini), "here").pulses == len(angles) // 2
+
+
+def test_sensor_beside_one_with_dwell_times_has_weights_of_one(mini: Path) -> None:
+    write(mini, "directions.csv", "elevation_deg,azimuth_deg,dwell_s\n-9,0,1\n")
+    other = "sensors.other={range_m=90, pattern={kind='file', file='directions.csv', samples=1}}"
+    plain, beside = (egvs.build_scene(egvs.load(mini, settings)) for settings in ([], [other]))
+    rows = [Scanner(scene).scan_site(scene.sites[0]).rows for scene in (plain, beside)]
+    assert rows[0].weight is None
+    assert rows[1].weight is not None
+    assert set(rows[1].weight.tolist()) == {1.0}
+    np.testing.assert_array_equal(rows[0].ends_m, rows[1].ends_m)
 
 
 def hits_at_sites(folder: Path, out: Path) -> NDArray[np.float64]:

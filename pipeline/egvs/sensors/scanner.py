@@ -183,10 +183,10 @@ class Scanner:
             rows = _concatenate_scans(chunks)
         else:
             rows = cast(pose.position_m, directions, sensor.range_m)
-            if self.scene.weights_beams:
-                rows = replace(rows, weight=np.ones(len(rows.beam)))
         for cut in self._cuts:
             rows = cut(rows, pose)
+        if rows.weight is None and self.scene.weights_beams:  # another sensor of the scenario has dwell times
+            rows = replace(rows, weight=np.ones(len(rows.beam)))
         return Scan(pose, sensor, sensor.beams, rows)
 
     def _caster(self, at_sites: bool, supports: tuple[int, ...]) -> Caster:
