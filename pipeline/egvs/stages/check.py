@@ -142,7 +142,10 @@ def check_inputs(inputs: Inputs, scene: SceneReport | None = None) -> CheckRepor
         readable, findings = stage_inputs.resolve_check_inputs(inputs)
         counts = _count_checked(readable)
     else:
-        readable, findings = CheckInputs(inputs.scenario, inputs.network), list(stage_inputs.missing_files(inputs))
+        readable, findings = (
+            CheckInputs(inputs.scenario, inputs.network, complete=inputs),
+            list(stage_inputs.missing_files(inputs)),
+        )
         counts = scene.sites, scene.solids, scene.lanes
     for rule in RULES:
         if scene is not None and rule.__name__ in scene.warnings:

@@ -305,6 +305,8 @@ class CheckInputs:
         Sites and static world, without effects.
     solid_sources
         Which solids of the static world each file has.
+    complete
+        What these parts are read from, with all periods; None where the scenario is complete.
     """
 
     scenario: Scenario
@@ -314,6 +316,12 @@ class CheckInputs:
     sites: tuple[Site, ...] = ()
     scene: Scene | None = None
     solid_sources: tuple[SolidSource, ...] = ()
+    complete: Inputs | None = None
+
+    @property
+    def georeference(self) -> Georeference:
+        """Where the world frame lies on the Earth, the same for all periods; InputError as in :class:`Inputs`."""
+        return (self.complete or Inputs(self.scenario)).georeference
 
     def site_location(self, site: Site) -> str:
         """Return the file or key, and the name, of a site, for messages."""
@@ -359,7 +367,7 @@ def resolve_check_inputs(inputs: Inputs) -> tuple[CheckInputs, list[Diagnostic]]
     errors.attempt("zones", lambda: zones.reported_zones(scenario))
     carriageway = None if network is None else inputs.carriageway
     sources = () if built is None else tuple(built[1].sources)
-    readable = CheckInputs(scenario, network, carriageway, world, solid_sources=sources)
+    readable = CheckInputs(scenario, network, carriageway, world, solid_sources=sources, complete=inputs)
 
     candidates = errors.attempt("sites", lambda: inputs.candidates)
     if candidates is None:

@@ -16,6 +16,7 @@ from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Roi
 from egvs.effects import registry
 from egvs.formats import xml
+from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
 from egvs.stages import height_checks
 from egvs.stages.inputs import CheckInputs, ErrorCollector
@@ -235,7 +236,7 @@ def check_traffic_heights(inputs: CheckInputs) -> Iterator[Diagnostic]:
     if not traffic.is_finished:
         return
     try:
-        positions_m = _recorded_positions_m(scenario)
+        positions_m = _recorded_positions_m(scenario, inputs.georeference)
     except InputError:
         return  # check_finished_files reports it
     key = f"{sumo_folder.traffic_location(scenario)}.{traffic_sources.source_key(traffic) or 'fcd'}"
@@ -244,9 +245,8 @@ def check_traffic_heights(inputs: CheckInputs) -> Iterator[Diagnostic]:
     yield from height_checks.compare_traffic(inputs, inputs.carriageway, positions_m, key)
 
 
-def _recorded_positions_m(scenario: Scenario) -> FloatArray:
+def _recorded_positions_m(scenario: Scenario, world: Georeference) -> FloatArray:
     """Return the first positions of vehicles near the region, on the road, (n, 3), world frame."""
-    world = geolocation.scenario_georeference(scenario)
     traffic = scenario.traffic
     tables: Iterable[pa.Table]
     if traffic.fcd is None:
@@ -282,8 +282,9 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         effects, _ = registry.active_traffic_effects(scenario)
         errors.attempt("traffic", lambda: recording.check_recorded_people(scenario, effects))
     if traffic_sources.source_key(scenario.traffic) is not None:
-        world = geolocation.scenario_georeference(scenario)
-        recorded = errors.attempt("traffic", lambda: traffic_sources.source_of(scenario).record(scenario, world))
+        recorded = errors.attempt(
+            "traffic", lambda: traffic_sources.source_of(scenario).record(scenario, inputs.georeference)
+        )
         if recorded is not None:
             yield from recorded.warnings
             yield from errors.attempt("traffic", partial(_recorded_findings, scenario, recorded)) or ()
@@ -297,7 +298,7 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         yield from finished_fcd.presence_warnings(scenario, content)
         if vtypes is not None:
             classes = finished_fcd.vehicle_classes(scenario, content, vtypes)
-            yield from errors.attempt("traffic", partial(_fcd_findings, scenario, classes)) or ()
+            yield from errors.attempt("traffic", partial(_fcd_findings, inputs, classes)) or ()
     yield from errors.findings
 
 
@@ -314,14 +315,15 @@ def _recorded_findings(scenario: Scenario, recorded: RecordedTraffic) -> list[Di
     return list(compared.findings(where))
 
 
-def _fcd_findings(scenario: Scenario, classes: Mapping[str, str]) -> list[Diagnostic]:
+def _fcd_findings(inputs: CheckInputs, classes: Mapping[str, str]) -> list[Diagnostic]:
     """Compare the vehicles of a finished FCD file with the roads."""
+    scenario = inputs.scenario
     name = scenario.traffic.fcd
     assert name is not None
     path = scenario.find(name, "traffic.fcd")
     rows = fcd.read_fcd(path)
     if finished_fcd.read_fcd_metadata(path) is None:
-        rows = fcd.georeference_rows(rows, geolocation.scenario_georeference(scenario), path, scenario.traffic.fcd_geo)
+        rows = fcd.georeference_rows(rows, inputs.georeference, path, scenario.traffic.fcd_geo)
     motor_types = frozenset(name for name, vclass in classes.items() if vclass in ROAD_VCLASSES)
     compared = road_check.check_tables(rows, sumo_folder.read_network(scenario), scenario.roi.box, motor_types)
     return list(compared.findings(f"{sumo_folder.traffic_location(scenario)}.fcd = {name!r}"))
