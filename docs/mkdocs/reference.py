@@ -40,6 +40,7 @@ scenario.
 TABLES: dict[str, str] = {
     "scores": "scores.parquet",
     "scores_by_period": "scores_by_period.parquet",
+    "levels": "levels.parquet",
     "blindspots": "blindspots.parquet",
     "zones": "zones.parquet",
     "trajectories": "trajectories.parquet",
