@@ -38,7 +38,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,19 +48,20 @@ from egvs.artefacts.tpog import PeriodBlocks, read_periods
 from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
-from egvs.effects.base import Detect
+from egvs.effects.returns import reflectivity_of
 from egvs.kernels import occlusion, vehicle_visibility
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SAMPLED_FRAMES, WeightsConfig
 from egvs.scoring.standard_errors import BlockGroups, block_groups
 from egvs.scoring.visibility import Beams
-from egvs.sensors.scene import Scene
-from egvs.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 Floats = FloatArray
+
+ByReflectivity = Callable[[FloatArray, FloatArray], FloatArray]
+"""Probability (n,) by range (n,), in metres, and by reflectivity (n,)."""
 
 SEEN_WELL_POINTS = 20.0
 """n0: the gain of a vehicle with this many points is 63 %, with three times as many 95 %."""
@@ -189,6 +190,11 @@ class TargetRecord:
     def are_people(self) -> NDArray[np.bool_]:
         """Which rows are on foot or on a bicycle, (n,)."""
         return np.array([kind in NON_VEHICLE_KINDS for kind in self.kinds], dtype=np.bool_)[self.kind]
+
+    @property
+    def reflectivity(self) -> FloatArray:
+        """Reflectivity of each row by its class, (n,) float64."""
+        return reflectivity_of(self.kinds)[self.kind]
 
     @classmethod
     def read(
@@ -378,7 +384,7 @@ class VisibleTargets(TargetVisibility):
 
 
 def visible_targets(
-    record: TargetRecord, beams: Beams, return_probability: Callable[[FloatArray], FloatArray] | None = None
+    record: TargetRecord, beams: Beams, return_probability: ByReflectivity | None = None
 ) -> VisibleTargets:
     """Return what a site sees of the vehicle-frames of a record.
 
@@ -389,7 +395,8 @@ def visible_targets(
     beams
         The site's empty scan.
     return_probability
-        Probability that a return from each range (n,) is detected; 1 where it is None.
+        Probability that returns are detected, by range (n,) and reflectivity (n,), as
+        :class:`egvs.effects.returns.ReturnProbability`; 1 where it is None.
     """
     row, boxes = record.row, record.all_boxes.values[record.row]
     yaw_rad = boxes[:, 3]
@@ -402,7 +409,7 @@ def visible_targets(
     hits = _count_points(record, sensor_m, beams, return_probability)
     points_alone = hits.alone[row]
     if return_probability is not None:
-        points_alone = points_alone * return_probability(range_m)
+        points_alone = points_alone * return_probability(range_m, record.reflectivity)
     bounds_m, slices = np.stack([hits.low[row], hits.high[row]], axis=1), hits.slices[row]
     spans = span_shares(record, bounds_m)
     return VisibleTargets(
@@ -456,24 +463,6 @@ def longest_holes_m(record: TargetRecord, slices: NDArray[np.uint64]) -> FloatAr
     return share * length_m
 
 
-def detection_probability(scene: Scene, sensor: Sensor) -> Callable[[FloatArray], FloatArray] | None:
-    """Return the probability that a return from each range (n,) is detected, with all effects of a scene.
-
-    None where no effect loses returns.
-    """
-    effects: tuple[Detect[Any], ...] = scene.acting(Detect, "score")
-    if not effects:
-        return None
-
-    def probability(range_m: FloatArray) -> FloatArray:
-        product = np.ones(len(range_m))
-        for effect in effects:
-            product = product * effect.detect(range_m, sensor)
-        return product
-
-    return probability
-
-
 class _BoxHits(NamedTuple):
     """Points on every box of a record, (b,); ``low`` and ``high`` bound them along the box's axes, (b, 2), metres."""
 
@@ -491,7 +480,7 @@ def _count_points(
     record: TargetRecord,
     sensor_m: FloatArray,
     site: Beams,
-    return_probability: Callable[[FloatArray], FloatArray] | None,
+    return_probability: ByReflectivity | None,
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
     is_counted = site.weight is None and return_probability is None
@@ -505,7 +494,9 @@ def _count_points(
     result = _BoxHits(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds)
     nearest_m = beams.length_m.copy()
     capacity = 0
+    reflectivity = np.zeros(count)
     if return_probability is not None:
+        reflectivity[record.row] = record.reflectivity
         capacity = max(MAX_HITS, len(beams.length_m))
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
@@ -516,7 +507,7 @@ def _count_points(
         )
         if return_probability is not None:
             box, row, hit_range_m, along_m, across_m = (column[:filled] for column in hits)
-            weight = beams.weight[row] * return_probability(hit_range_m)
+            weight = beams.weight[row] * return_probability(hit_range_m, reflectivity[box])
             vehicle_visibility.accumulate_hits(box, weight, along_m, across_m, boxes.values, tuple(result[1:]))
     return result
 
