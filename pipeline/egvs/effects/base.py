@@ -197,6 +197,8 @@ class Detect(Effect[P]):
 
     STAGE: ClassVar[str] = "score"
     KIND: ClassVar[str] = "detect"
+    THINS_SPANS: ClassVar[bool] = False
+    """Whether the span of the points on a vehicle is that of the returns which are left, in expectation."""
 
     def refusal(self, scene: Scene) -> InputError | None:
         """Return the error for a sensor that lacks a value which the effect needs."""

@@ -47,6 +47,7 @@ class RangeLimit(Detect[RangeLimitParameters]):
         "Höfle and Pfeifer 2007 (power law); the sensor's datasheet (threshold); fitted on two units"
     )
     Model: ClassVar[type[EffectParameters]] = RangeLimitParameters
+    THINS_SPANS: ClassVar[bool] = True
 
     @property
     def settings(self) -> dict[str, Any]:

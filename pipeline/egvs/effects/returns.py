@@ -44,6 +44,11 @@ class ReturnProbability:
         acting = tuple(effect for effect in effects if effect.acts_on(sensor))
         return cls(acting, sensor) if acting else None
 
+    @property
+    def thins_spans(self) -> bool:
+        """Whether a beam counts by its probability where the span of points is measured, not fully."""
+        return any(effect.THINS_SPANS for effect in self.effects)
+
     def __call__(self, range_m: FloatArray, reflectivity: FloatArray | None = None) -> FloatArray:
         """Return the probability that a return is detected, (n,) float64, 0 to 1.
 
