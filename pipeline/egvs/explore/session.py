@@ -32,6 +32,7 @@ from egvs.clouds import simulation as cloud_simulation
 from egvs.clouds.simulation import CloudSimulator, VehicleMeshes, sweep_rng
 from egvs.core.errors import Diagnostic, InputError, choose_one
 from egvs.core.grid import Grid
+from egvs.effects.returns import ReturnProbability
 from egvs.placement import problem_builder
 from egvs.placement.refinement import PlanPoses
 from egvs.results.labels import SCORE_LABELS
@@ -44,7 +45,7 @@ from egvs.scoring.egvs import EntropyField
 from egvs.scoring.points_map import PointsMap, TargetPositions
 from egvs.scoring.scorer import PeriodTpog, Scorer
 from egvs.scoring.target_scores import TARGET_SCORES
-from egvs.scoring.targets import SEEN_WELL_POINTS, detection_probability, visible_targets
+from egvs.scoring.targets import SEEN_WELL_POINTS, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
@@ -367,7 +368,7 @@ class Session:
         targets = self._recorded.spot_scorer
         assert targets.spots is not None
         beams = self.beams(site)
-        probability = detection_probability(self.scene_with(site), beams.sensor)
+        probability = ReturnProbability.of(self.scene_with(site), beams.sensor)
         visible = visible_targets(targets.record, beams, probability)
         visibility = targets.spots.visibility(visible.points, TARGET_SCORES[DEFAULT_SCORE](visible, targets.detectors))
         return site_blindspots(site.name, targets.spots, visibility, self.tpog.grid)
@@ -390,7 +391,7 @@ class Session:
         for place in self._recorded.positions:
             if place.target.name == target:
                 beams = self.beams(site)
-                return place.points_map(beams, detection_probability(self.scene_with(site), beams.sensor))
+                return place.points_map(beams, ReturnProbability.of(self.scene_with(site), beams.sensor))
         return None
 
     def scene_with(self, site: Site) -> Scene:
@@ -473,7 +474,7 @@ class Session:
         scores |= {name: float(values[0]) for name, values in result.shares.items()}
         if self._targets is None:
             return scores
-        visible = visible_targets(self._targets.record, beams, detection_probability(engine.scene, beams.sensor))
+        visible = visible_targets(self._targets.record, beams, ReturnProbability.of(engine.scene, beams.sensor))
         target_scores = self._targets.scores(visible)
         if self.period:
             return {**scores, **target_scores.by_period[self.periods.index(self.period)]}

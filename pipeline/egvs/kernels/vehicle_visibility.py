@@ -46,6 +46,12 @@ _STEEPEST = 1e308
 SLICES = 64
 """Slices of a vehicle's length, to find the longest stretch without points."""
 
+NEGLIGIBLE_CHANCE = 1e-4
+"""Gaps that are rarer than this are not added up."""
+
+MAX_STEP_CHANGE = 0.25
+"""Chances of gaps are interpolated over steps with at most this number of slices times the change of the chance."""
+
 _ON_SIDE_M = 1e-6
 """A beam that ends within this distance of the plane of a side meets the side, not the roof."""
 
@@ -335,6 +341,39 @@ def _add_box_hits(b, box, directions, rows, nearest_m, weight, sums):  # type: i
 
 
 @_kernel
+def _thin_box_hits(b, box, directions, rows, nearest_m, weight, loss, sums):  # type: ignore[no-untyped-def]
+    """Fill the sums of :func:`first_hits` for box b, on which the beams ``rows`` end, of which some are lost."""
+    shares, share_row, per_m, misses = loss
+    ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
+    bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
+    x, y, z = directions[0], directions[1], directions[2]
+    total, sides, slices, low, high = sums
+    by_range, last = shares[share_row[b]], shares.shape[1] - 2
+    by_length, by_width = misses[b, 0], misses[b, 1]
+    hit_weight, on_sides, parts, is_weighted = 0.0, 0.0, np.uint64(0), weight.shape[0] > 0
+    a_low, a_high, b_low, b_high = np.inf, -np.inf, np.inf, -np.inf
+    for n in rows:
+        steps = nearest_m[n] * per_m
+        step = min(np.int64(steps), last)
+        share = by_range[step] + min(steps - step, 1.0) * (by_range[step + 1] - by_range[step])
+        if is_weighted:
+            share *= weight[n]
+        if share > 0.0:
+            along = ao + nearest_m[n] * (ax * x[n] + ay * y[n] + az * z[n])
+            across = bo + nearest_m[n] * (bx * x[n] + by * y[n] + bz * z[n])
+            hit_weight += share
+            on_sides += share if _is_on_side(along, across, ah, bh) else 0.0
+            part = _slice_of(along, ah)
+            parts |= np.uint64(1) << part
+            by_length[part] *= 1.0 - share
+            by_width[_slice_of(across, bh)] *= 1.0 - share
+            a_low, a_high = min(a_low, along), max(a_high, along)
+            b_low, b_high = min(b_low, across), max(b_high, across)
+    total[b], sides[b], slices[b] = hit_weight, on_sides, parts
+    low[b, 0], high[b, 0], low[b, 1], high[b, 1] = a_low, a_high, b_low, b_high
+
+
+@_kernel
 def _list_box_hits(b, box, directions, rows, nearest_m, hits, count):  # type: ignore[no-untyped-def]
     """List the hits of the beams ``rows`` on box b of all frames after ``count``; returns the new number."""
     x, y, z = directions[0], directions[1], directions[2]
@@ -379,7 +418,7 @@ def _reset(runs, length_m, nearest_m):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: ignore[no-untyped-def]
+def first_hits(begin, o, size_m, boxes, beams, nearest_m, loss, sums, hits):  # type: ignore[no-untyped-def]
     """Add up, or list, the beams that meet each box first: of all frames, or as many as fit in the list.
 
     Parameters
@@ -399,6 +438,12 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: 
         listed only where there are weights.
     nearest_m
         Scratch, (m,) float64: the length of each beam, before and after the call.
+    loss
+        Losses of returns, where beams are added up: ``shares``, the share of returns that are detected at equidistant
+        ranges from 0, interpolated between them, a row for each reflectivity, (k, m) float64, m > 1; no row where all
+        are detected. ``share_row``: the row of each box, (b,) int64. ``per_m``: steps in a metre. ``misses``, 1 at
+        first, is multiplied by the probability that no return is from a slice: of the length, and of the width,
+        (b, 2, SLICES) float32; (0, 2, SLICES) where all returns are detected.
     sums
         Filled: ``alone``, (b,) float64, the weight of all beams that meet the box, occluded or not; 0 at first. And,
         for ``listed`` boxes, unless ``hits`` are listed, of the beams that meet it first: ``total``, (b,) float64,
@@ -450,11 +495,13 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: 
             alone[box[k]] = met if weight.shape[0] == 0 else _met_weight(box_runs, box_t_m, weight)
         for k in range(oriented):
             b, box_runs, box_t_m = box[k], runs[k, : filled[k]], t_m[offset[k] :]
-            if listed[b] and weight.shape[0] == 0:
+            if listed[b] and weight.shape[0] == 0 and loss[0].shape[0] == 0:
                 _count_box_hits(b, facing[k], directions, box_runs, nearest_m, box_t_m, added)
             elif listed[b]:
                 box_rows = rows[: _list_rows(box_runs, nearest_m, box_t_m, rows)]
-                if room > 0:
+                if loss[0].shape[0] > 0:
+                    _thin_box_hits(b, facing[k], directions, box_rows, nearest_m, weight, loss, added)
+                elif room > 0:
                     count = _list_box_hits(b, facing[k], directions, box_rows, nearest_m, hits, count)
                 else:
                     _add_box_hits(b, facing[k], directions, box_rows, nearest_m, weight, added)
@@ -500,6 +547,102 @@ def longest_slice_gaps(slices, share):  # type: ignore[no-untyped-def]
                     longest = max(longest, part - last - 1)
                 last = part
         share[i] = longest / SLICES
+
+
+@_kernel
+def expected_spans(misses, bounds_m, sizes_m, spans):  # type: ignore[no-untyped-def]
+    """Fill the expected distance between the outermost points, as a share of each vehicle's length and width.
+
+    A point in a slice counts at its outer end, but not beyond ``bounds_m``. Points are lost independently.
+
+    Parameters
+    ----------
+    misses
+        Probability that a slice has no point: of the length, and of the width, (n, 2, SLICES) float32.
+    bounds_m
+        Lowest and highest coordinate of any point that may be detected, (n, 2, 2) float64.
+    sizes_m
+        Length and width, (n, 2) float64.
+    spans
+        Filled: shares, (n, 2) float64; 0 for a vehicle without points.
+    """
+    for i in range(misses.shape[0]):
+        for axis in range(2):
+            low, high = bounds_m[i, 0, axis], bounds_m[i, 1, axis]
+            if not high > low:
+                spans[i, axis] = 0.0
+                continue
+            size, empty_below, empty_above, span = sizes_m[i, axis], 1.0, 1.0, 0.0
+            for part in range(SLICES):
+                below, above = misses[i, axis, part], misses[i, axis, SLICES - 1 - part]
+                if below < 1.0:  # the lowest point is in this slice
+                    span -= empty_below * (1.0 - below) * max(low, size * (part / SLICES - 0.5))
+                    empty_below *= below
+                if above < 1.0:
+                    span += empty_above * (1.0 - above) * min(high, size * (0.5 - part / SLICES))
+                    empty_above *= above
+            spans[i, axis] = min(max(span / size, 0.0), 1.0)
+
+
+@_kernel
+def _chance_of_gap(miss, part, count, gap, ends):  # type: ignore[no-untyped-def]
+    """Probability that ``gap`` or more slices without points lie between two slices with points.
+
+    All gaps are shorter with the probability of the sum over s of f(s) times that no point follows slice s, plus that
+    no slice has a point, where f(s) is the probability that s has a point and all gaps before it are shorter.
+
+    Parameters
+    ----------
+    miss, part
+        Probability that a slice has no point, below 1, and the number of this slice, ascending; (m,) float64 and int64.
+    count
+        Number of slices, at most m.
+    gap
+        Number of slices without points, at least 1.
+    ends
+        Scratch, (m,) float64: f.
+    """
+    none_before = 1.0
+    for s in range(count):
+        reached, empty, before = none_before, 1.0, s - 1
+        while before >= 0 and part[s] - part[before] <= gap:
+            reached += ends[before] * empty
+            empty *= miss[before]
+            before -= 1
+        ends[s] = reached * (1.0 - miss[s])
+        none_before *= miss[s]
+    shorter, none_after = none_before, 1.0
+    for s in range(count - 1, -1, -1):
+        shorter += ends[s] * none_after
+        none_after *= miss[s]
+    return max(1.0 - shorter, 0.0)
+
+
+@_kernel
+def expected_gaps(misses, share):  # type: ignore[no-untyped-def]
+    """Fill the expected longest stretch between two slices with points, as a share of the length, (n,) float64.
+
+    ``misses``: probability that a slice has no point, as of :func:`expected_spans`, (n, 2, SLICES) float32.
+    """
+    miss, part, ends = np.empty(SLICES), np.empty(SLICES, np.int64), np.empty(SLICES)
+    for i in range(misses.shape[0]):
+        count = 0
+        for s in range(SLICES):
+            if misses[i, 0, s] < 1.0:
+                miss[count], part[count] = misses[i, 0, s], s
+                count += 1
+        total, gap, chance = 0.0, 0, 1.0  # sums the chances of gaps 1, 2, ...; longer ones are rarer
+        most = part[count - 1] - part[0] - 1 if count > 1 else 0
+        step = 1
+        while gap < most and chance > NEGLIGIBLE_CHANCE:
+            step = min(step, most - gap)
+            next_chance = _chance_of_gap(miss, part, count, gap + step, ends)
+            while step > 1 and (chance - next_chance) * step > MAX_STEP_CHANGE:
+                step //= 2
+                next_chance = _chance_of_gap(miss, part, count, gap + step, ends)
+            total += 0.5 * ((step - 1) * chance + (step + 1) * next_chance)  # linear in between
+            gap, chance, step = gap + step, next_chance, 2 * step
+        share[i] = total / SLICES
 
 
 @_kernel

@@ -38,7 +38,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,19 +48,20 @@ from egvs.artefacts.tpog import PeriodBlocks, read_periods
 from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
-from egvs.effects.base import Detect
+from egvs.effects.returns import ReturnProbability, reflectivity_of
 from egvs.kernels import occlusion, vehicle_visibility
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SAMPLED_FRAMES, WeightsConfig
 from egvs.scoring.standard_errors import BlockGroups, block_groups
 from egvs.scoring.visibility import Beams
-from egvs.sensors.scene import Scene
-from egvs.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 Floats = FloatArray
+
+ByReflectivity = Callable[[FloatArray, FloatArray], FloatArray]
+"""Probability (n,) by range (n,), in metres, and by reflectivity (n,)."""
 
 SEEN_WELL_POINTS = 20.0
 """n0: the gain of a vehicle with this many points is 63 %, with three times as many 95 %."""
@@ -73,6 +74,9 @@ _BANDS = 12
 
 _STRIDE = 13
 """Every so manyth beam tells where bands begin; not a divisor of any common number of channels."""
+
+_STEPS_PER_M = 50.0
+"""Steps of range between which the probability of returns is interpolated."""
 
 MAX_HITS = 2**17
 """Hits that are listed at once, which bounds the memory."""
@@ -189,6 +193,11 @@ class TargetRecord:
     def are_people(self) -> NDArray[np.bool_]:
         """Which rows are on foot or on a bicycle, (n,)."""
         return np.array([kind in NON_VEHICLE_KINDS for kind in self.kinds], dtype=np.bool_)[self.kind]
+
+    @property
+    def reflectivity(self) -> FloatArray:
+        """Reflectivity of each row by its class, (n,) float64."""
+        return reflectivity_of(self.kinds)[self.kind]
 
     @classmethod
     def read(
@@ -326,11 +335,11 @@ class TargetVisibility:
         Those of ``points`` that are not on its roof (or, from below, its underside), (n,) float64.
     length_share, width_share
         Share of the vehicle's length and of its width between the outermost of its points, along the box's axes, (n,)
-        float64, 0 to 1; 0 without a point. Where effects weight beams or lose returns, a beam whose point has any
-        probability at all counts in full.
+        float64, 0 to 1; 0 without a point. With losses of returns, the expected share. Where other effects weight beams
+        or lose returns, a beam whose point has any probability at all counts in full.
     hole_m
         Longest stretch of the vehicle's length, between its outermost points, without a point, (n,) float64, to 1/64 of
-        its length; 0 without a point. Counted as the shares are.
+        its length; 0 without a point. With losses of returns, its expected value.
     range_m
         From the sensor to the box's centre, (n,) float64.
     depression_deg
@@ -339,11 +348,14 @@ class TargetVisibility:
         Sine of the angle in plan between the line of sight and the vehicle's length, (n,) float64: 0 from ahead or
         behind, 1 broadside.
     bounds_m
-        Lowest and highest coordinate of its points, along and across the vehicle from its centre, (n, 2, 2) float64;
-        infinite and minus infinite without a point.
+        Lowest and highest coordinate of its points, of any probability, along and across the vehicle from its centre,
+        (n, 2, 2) float64; infinite and minus infinite without a point.
     slices
-        Which of the 64 equal slices of the vehicle's length, from the rear, have a point: one bit each, (n,) uint64.
-        Counted as the shares are.
+        Which of the 64 equal slices of the vehicle's length, from the rear, have a point of any probability: one bit
+        each, (n,) uint64.
+    misses
+        With losses of returns, the probability that a slice has no point: of the length, and of the width, (n, 2, 64)
+        float32; None without.
     """
 
     record: TargetRecord
@@ -358,6 +370,7 @@ class TargetVisibility:
     side: FloatArray
     bounds_m: FloatArray
     slices: NDArray[np.uint64]
+    misses: NDArray[np.float32] | None
 
     def __len__(self) -> int:
         """Number of vehicle-frames."""
@@ -378,7 +391,7 @@ class VisibleTargets(TargetVisibility):
 
 
 def visible_targets(
-    record: TargetRecord, beams: Beams, return_probability: Callable[[FloatArray], FloatArray] | None = None
+    record: TargetRecord, beams: Beams, return_probability: ByReflectivity | None = None
 ) -> VisibleTargets:
     """Return what a site sees of the vehicle-frames of a record.
 
@@ -389,7 +402,8 @@ def visible_targets(
     beams
         The site's empty scan.
     return_probability
-        Probability that a return from each range (n,) is detected; 1 where it is None.
+        Probability that returns are detected, by range (n,) and reflectivity (n,), as
+        :class:`egvs.effects.returns.ReturnProbability`; 1 where it is None.
     """
     row, boxes = record.row, record.all_boxes.values[record.row]
     yaw_rad = boxes[:, 3]
@@ -402,9 +416,10 @@ def visible_targets(
     hits = _count_points(record, sensor_m, beams, return_probability)
     points_alone = hits.alone[row]
     if return_probability is not None:
-        points_alone = points_alone * return_probability(range_m)
+        points_alone = points_alone * return_probability(range_m, record.reflectivity)
     bounds_m, slices = np.stack([hits.low[row], hits.high[row]], axis=1), hits.slices[row]
-    spans = span_shares(record, bounds_m)
+    misses = None if hits.misses is None else hits.misses[row]
+    spans, hole_m = spans_and_holes(record, bounds_m, slices, misses)
     return VisibleTargets(
         record=record,
         points=hits.points[row],
@@ -412,14 +427,56 @@ def visible_targets(
         points_on_sides=hits.on_sides[row],
         length_share=spans[:, 0],
         width_share=spans[:, 1],
-        hole_m=longest_holes_m(record, slices),
+        hole_m=hole_m,
         range_m=range_m,
         depression_deg=np.degrees(np.arctan2(-away_m[:, 2], run_m)),
         side=np.divide(across_m, run_m, out=np.zeros(len(row)), where=run_m > 0.0),
         bounds_m=bounds_m,
         slices=slices,
+        misses=misses,
         sensor_m=sensor_m,
     )
+
+
+def spans_and_holes(
+    record: TargetRecord, bounds_m: FloatArray, slices: NDArray[np.uint64], misses: NDArray[np.float32] | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the shares of length and width between the outermost points, (n, 2), and the longest holes, (n,), metres.
+
+    Both are expected values where returns are lost.
+
+    Parameters
+    ----------
+    record
+        The vehicles.
+    bounds_m, slices, misses
+        As in :class:`TargetVisibility`.
+    """
+    if misses is None:
+        return span_shares(record, bounds_m), longest_holes_m(record, slices)
+    sizes_m = np.ascontiguousarray(record.all_boxes.values[record.row, 5:7])
+    spans, hole = np.zeros((len(record), 2)), np.zeros(len(record))
+    vehicle_visibility.expected_spans(misses, bounds_m, sizes_m, spans)
+    vehicle_visibility.expected_gaps(misses, hole)
+    return spans, hole * sizes_m[:, 0]
+
+
+def slice_misses(visible: TargetVisibility) -> NDArray[np.float32]:
+    """Return ``misses`` of :class:`TargetVisibility`, (n, 2, 64) float32; 0 or 1 without losses of returns.
+
+    Of a view without losses, the slices of the width with its outermost points count.
+    """
+    if visible.misses is not None:
+        return visible.misses
+    parts = np.arange(vehicle_visibility.SLICES)
+    misses = np.ones((len(visible), 2, len(parts)), dtype=np.float32)
+    misses[:, 0] = (visible.slices[:, None] >> parts.astype(np.uint64)) & np.uint64(1) == 0
+    rows = np.flatnonzero(visible.points > 0.0)
+    width_m = visible.record.all_boxes.values[visible.record.row[rows], 6]
+    for end_m in (visible.bounds_m[rows, 0, 1], visible.bounds_m[rows, 1, 1]):
+        part = np.clip(len(parts) * (end_m / width_m + 0.5), 0, len(parts) - 1).astype(np.int64)
+        misses[rows, 1, part] = 0.0
+    return misses
 
 
 def span_shares(record: TargetRecord, bounds_m: FloatArray) -> FloatArray:
@@ -456,24 +513,6 @@ def longest_holes_m(record: TargetRecord, slices: NDArray[np.uint64]) -> FloatAr
     return share * length_m
 
 
-def detection_probability(scene: Scene, sensor: Sensor) -> Callable[[FloatArray], FloatArray] | None:
-    """Return the probability that a return from each range (n,) is detected, with all effects of a scene.
-
-    None where no effect loses returns.
-    """
-    effects: tuple[Detect[Any], ...] = scene.acting(Detect, "score")
-    if not effects:
-        return None
-
-    def probability(range_m: FloatArray) -> FloatArray:
-        product = np.ones(len(range_m))
-        for effect in effects:
-            product = product * effect.detect(range_m, sensor)
-        return product
-
-    return probability
-
-
 class _BoxHits(NamedTuple):
     """Points on every box of a record, (b,); ``low`` and ``high`` bound them along the box's axes, (b, 2), metres."""
 
@@ -485,40 +524,70 @@ class _BoxHits(NamedTuple):
     """Which slices of the box's length have points, as bits."""
     low: FloatArray
     high: FloatArray
+    misses: NDArray[np.float32] | None
+    """Probability that slices have no point, see :class:`TargetVisibility`."""
+
+
+class Losses(NamedTuple):
+    """Losses of returns in the form that :func:`egvs.kernels.vehicle_visibility.first_hits` takes."""
+
+    shares: FloatArray
+    share_row: IntArray
+    per_m: float
+    misses: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, record: TargetRecord, return_probability: ByReflectivity, farthest_m: float) -> Losses:
+        """Tabulate the probability of returns up to a range, for each reflectivity of the record."""
+        reflectivity, row = np.unique(record.reflectivity, return_inverse=True)
+        range_m = np.arange(math.ceil(farthest_m * _STEPS_PER_M) + 2) / _STEPS_PER_M
+        shares = [return_probability(range_m, np.full(len(range_m), rho)) for rho in reflectivity]
+        count = len(record.all_boxes.values)
+        share_row = np.zeros(count, dtype=np.int64)
+        share_row[record.row] = row
+        misses = np.ones((count, 2, vehicle_visibility.SLICES), dtype=np.float32)
+        return cls(np.array(shares).reshape(len(shares), -1), share_row, _STEPS_PER_M, misses)
+
+
+NO_LOSSES = Losses(
+    np.empty((0, 0)), np.empty(0, np.int64), 1.0, np.empty((0, 2, vehicle_visibility.SLICES), np.float32)
+)
+"""Every return is detected."""
 
 
 def _count_points(
-    record: TargetRecord,
-    sensor_m: FloatArray,
-    site: Beams,
-    return_probability: Callable[[FloatArray], FloatArray] | None,
+    record: TargetRecord, sensor_m: FloatArray, site: Beams, return_probability: ByReflectivity | None
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
-    is_counted = site.weight is None and return_probability is None
-    beams = sort_beams(site, _BANDS if is_counted else 1)
+    thins_spans = isinstance(return_probability, ReturnProbability) and return_probability.thins_spans
+    is_listed = return_probability is not None and not thins_spans
+    beams = sort_beams(site, 1 if is_listed or site.weight is not None else _BANDS)
     is_target = np.zeros(count, dtype=np.bool_)
     is_target[record.row] = True
     size_m = np.asarray(record.grid.roi.size_m)
     all_boxes = *boxes.between(sensor_m, size_m), boxes.values, boxes.low, boxes.high, is_target
 
     bounds = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    result = _BoxHits(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds)
+    sums = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds
     nearest_m = beams.length_m.copy()
-    capacity = 0
-    if return_probability is not None:
+    losses, capacity, reflectivity = NO_LOSSES, 0, np.zeros(count)
+    if return_probability is not None and thins_spans:
+        losses = Losses.of(record, return_probability, float(beams.length_m.max(initial=0.0)))
+    elif return_probability is not None:
         capacity = max(MAX_HITS, len(beams.length_m))
+        reflectivity[record.row] = record.reflectivity
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
     frame = 0
     while frame < len(record.numbers):
         frame, filled = vehicle_visibility.first_hits(
-            frame, sensor_m, size_m, all_boxes, tuple(beams), nearest_m, tuple(result), hits
+            frame, sensor_m, size_m, all_boxes, tuple(beams), nearest_m, tuple(losses), sums, hits
         )
-        if return_probability is not None:
+        if is_listed and return_probability is not None:
             box, row, hit_range_m, along_m, across_m = (column[:filled] for column in hits)
-            weight = beams.weight[row] * return_probability(hit_range_m)
-            vehicle_visibility.accumulate_hits(box, weight, along_m, across_m, boxes.values, tuple(result[1:]))
-    return result
+            weight = beams.weight[row] * return_probability(hit_range_m, reflectivity[box])
+            vehicle_visibility.accumulate_hits(box, weight, along_m, across_m, boxes.values, sums[1:])
+    return _BoxHits(*sums, losses.misses if thins_spans else None)
 
 
 class SortedBeams(NamedTuple):

@@ -7,11 +7,14 @@ and score stages that can change a result.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from egvs.core.errors import InputError
 from egvs.effects import registry
+from egvs.effects.base import Effect
 from egvs.scenario.model import Scenario
 from egvs.sensors import site_feasibility, sites
+from egvs.sensors.return_model import LossDecision, decide_losses
 from egvs.sensors.scene import InactiveEffect, Scene
 from egvs.sensors.site_feasibility import SiteSelection
 from egvs.sensors.sites import Site
@@ -74,15 +77,23 @@ def _check_kept_sites(scenario: Scenario, selection: SiteSelection) -> None:
 
 
 def with_effects(plain: Scene) -> Scene:
-    """Add the effects on beams and clouds that the scenario names and that can change a result."""
-    if not plain.scenario.effects.named:
-        return plain
-    active = []
+    """Add the effects on beams and clouds that can change a result: those of the scenario, and losses of returns."""
+    active: list[Effect[Any]] = []
     inactive = []
+    losses = _losses(plain)
+    if losses is not None and losses.acting:
+        active.append(registry.make_losses(losses.acting))
     for effect in registry.scenario_effects(plain.scenario, "scan", "score", "clouds"):
         reason = effect.why_idle(plain)
         if reason is None:
             active.append(effect)
         elif reason:
             inactive.append(InactiveEffect(effect.NAME, effect.STAGE, reason))
-    return replace(plain, effects=tuple(active), inactive_effects=tuple(inactive))
+    return replace(plain, effects=tuple(active), inactive_effects=tuple(inactive), losses=losses)
+
+
+def _losses(plain: Scene) -> LossDecision | None:
+    """The decision on losses of returns; None where the scenario makes it."""
+    if plain.scenario.effects.range_limit is not None:
+        return None
+    return decide_losses(plain.sites, plain.used_sensors, plain.roi)

@@ -26,6 +26,7 @@ from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.threads import map_ordered
+from egvs.effects.returns import ReturnProbability
 from egvs.kernels import occupancy, traversal
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED
@@ -47,7 +48,6 @@ from egvs.scoring.targets import (
     FrameGroups,
     TargetRecord,
     VisibleTargets,
-    detection_probability,
     recorded_frames,
     target_weights,
     visible_targets,
@@ -181,7 +181,7 @@ class TargetScorer:
 
     def visible(self, beams: Beams) -> VisibleTargets:
         """Return what an empty scan sees of each vehicle."""
-        return visible_targets(self.record, beams, detection_probability(self._scene, beams.sensor))
+        return visible_targets(self.record, beams, ReturnProbability.of(self._scene, beams.sensor))
 
     @cached_property
     def levels(self) -> dict[str, FloatArray]:
@@ -433,7 +433,7 @@ class SiteScoring:
         """What a scan sees of the road users of the zones: ``visible``, unless there are people without a weight."""
         if len(zones.record) == len(visible.record):
             return visible
-        return visible_targets(zones.record, beams, detection_probability(self.context.scene, beams.sensor))
+        return visible_targets(zones.record, beams, ReturnProbability.of(self.context.scene, beams.sensor))
 
     def score_table(self, sites: Iterable[ScoredSite]) -> ScoreTable:
         """Return the scores of sites as one table."""

@@ -40,6 +40,7 @@ from egvs.core.errors import InputError, choose_one
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.hardware.design_request import ALL_SENSORS, DesignRequest
 from egvs.extensions.hardware.files import SENSOR_DESIGN, design_digest
 from egvs.placement.refinement import Axis, BoxEnds, Freedom, minimise
@@ -55,7 +56,6 @@ from egvs.scoring.target_scores import expected_by_detector
 from egvs.scoring.targets import (
     FrameGroups,
     TargetRecord,
-    detection_probability,
     recorded_frames,
     target_weights,
     visible_targets,
@@ -417,7 +417,7 @@ class _Designer:
 
     def _chances(self, sensor: Sensor, pose: Pose, half: _Half) -> FloatArray | None:
         """Return the probability that each detector finds each vehicle of a half, (d, n); None as :meth:`_values`."""
-        probability = detection_probability(self._scene, sensor)  # InputError if an effect lacks a value of the sensor
+        probability = ReturnProbability.of(self._scene, sensor)  # InputError if an effect lacks a value of the sensor
         try:
             beams = Beams.of(self._scanner.scan(pose, sensor))
         except InputError:  # the only reasons: in a solid, below the ground, out of reach
