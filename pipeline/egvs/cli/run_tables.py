@@ -17,6 +17,7 @@ from rich.table import Table
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, PeriodRank, PeriodRanking
+from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.cli.console import (
     NARROW,
@@ -32,9 +33,10 @@ from egvs.core.errors import collect_warnings
 from egvs.core.wording import format_percent
 from egvs.report import sections
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability
+from egvs.results.levels import GROUPS_NOTE, GroupLevel, read_levels
 from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pole
 from egvs.scenario.effects_config import RangeLimitParameters
-from egvs.scenario.score_config import ALL_DETECTORS
+from egvs.scenario.score_config import ALL_DETECTORS, DEFAULT_SCORE, NOTICED
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
@@ -100,6 +102,10 @@ def print_scores(folder: Path, record: RunRecord, top: int | None = None, *, bef
     out.print(ranking_table(sites, out.width, top))
     for line in _outcome_sentences(folder, record, sites):
         out.print(line)
+    best = next(site for site in sites if site.rank == 1)
+    levels = read_levels(RunFolder(folder).levels, best.site)
+    if len(levels) > 1:
+        out.print(levels_table(best.site, levels))
     if top is not None and len(sites) > top:
         out.print(f"... and {len(sites) - top:,} more; omit --top, or see {folder / 'scores.parquet'}")
     if not before_answer and len({site.pole for site in sites}) < len(sites):
@@ -173,6 +179,9 @@ def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | Non
         columns.append(Column("std error", lambda site: by.error(site.score, site.score_se)))
         columns.append(Column("beats next", lambda site: _format_beats_next(site, by_rank[-1])))
     columns.append(Column("of best", partial(_format_share_of_best, best_score)))
+    if sites and all(site.noticed is not None for site in sites):
+        noticed_head = SCORE_LABELS[NOTICED].head
+        columns.append(Column(noticed_head, lambda site: site.noticed_cell, min_width=_EXTRA_COLUMNS_WIDTH))
     if companion is not None:
         columns.append(_score_column(companion))
     if "entropy seen" not in [column.title for column in columns]:
@@ -186,6 +195,17 @@ def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | Non
         chance = f"the probability that it truly scores higher is below {format_percent(DISTINCT_PROBABILITY, 0)}"
         caption = f"~ not separable from the next site: {chance}"
     return make_table(columns, shown, width=width, caption=caption)
+
+
+def levels_table(site: str, levels: Sequence[GroupLevel]) -> Table:
+    """Return what detectors should find and people would notice of each group of road users from a site."""
+    columns: list[Column[GroupLevel]] = [
+        Column(f"from {site}", lambda level: level.road_users, "left"),
+        Column("observations", lambda level: f"{level.observations:,}"),
+        Column(SCORE_LABELS[DEFAULT_SCORE].head, lambda level: level.found_text),
+        Column(SCORE_LABELS[NOTICED].head, lambda level: level.noticed.text),
+    ]
+    return make_table(columns, levels, caption=GROUPS_NOTE)
 
 
 def _ranking_score(sites: Sequence[RankedSite]) -> ScoreLabel:

@@ -36,7 +36,7 @@ from egvs.report.extension_sections import (
     section_modules,
 )
 from egvs.report.points_section import MAPPED_POLES, PointsSection
-from egvs.report.ranking_text import entropy_seen_note, headline, lead, recorded_frames_hint
+from egvs.report.ranking_text import entropy_seen_note, headline, lead, noticed_preference, recorded_frames_hint
 from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
@@ -55,11 +55,14 @@ from egvs.report.what_if_section import WhatIfSection
 from egvs.report.zone_section import ZoneSection
 from egvs.results import labels as formatting
 from egvs.results.command_entries import Entries, current_entries, what_if_digest
+from egvs.results.labels import SCORE_LABELS
+from egvs.results.levels import GROUPS_NOTE, GroupLevel, read_levels
 from egvs.results.map_credits import read_map_credits
 from egvs.results.plans import SensorPlan
 from egvs.results.ranking import RankedSite, Ranking, share_of_limit
 from egvs.results.sensors import SensorComparison
 from egvs.scenario.model import Scenario
+from egvs.scenario.score_config import NOTICED
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_dependencies import scan_dependencies
 from egvs.traffic import observed
@@ -80,6 +83,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 _OPTIONAL_FILES = (
     RunFolder.scores_by_period.name,
+    RunFolder.levels.name,
     RunFolder.blindspots.name,
     RunFolder.zones.name,
     RunFolder.plan_zones.name,
@@ -112,6 +116,8 @@ class PageContents:
         Results of other commands and of periods; None if those commands have not run.
     what_if
         Results of what-ifs.
+    levels
+        What detectors find and people notice of each group of road users from the best site.
     zones, points
         Road users found in zones, and maps of points on target; None where the scenario has no zones or no lanes.
     movements
@@ -135,6 +141,7 @@ class PageContents:
     movements: Mapping[str, str] = field(default_factory=dict)
     what_if: WhatIfSection = field(default_factory=WhatIfSection)
     zones: ZoneSection | None = None
+    levels: tuple[GroupLevel, ...] = ()
     points: PointsSection | None = None
     approaches: tuple[ApproachFit, ...] = ()
     approach_map: str = ""
@@ -271,6 +278,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         plan=None if plan is None else plan_values(plan, ranking.sites, tpog, drawn.backdrop),
         what_if=WhatIfSection.of(_current_what_ifs(work, stages), ranking.sites[0]),
         movements=describe_counts(work.scenario, network_file(out)),
+        levels=read_levels(work.folder.levels, ranking.sites[0].site),
         zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
         points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
         approaches=approaches,
@@ -343,6 +351,8 @@ def _ranking_values(ranking: Ranking) -> dict[str, Any]:
         "map_names": maps.describe_names(ranking.sites),
         "limit_share": limit_share,
         "best_name": ranking.sites[0].site,
+        "noticed": SCORE_LABELS[NOTICED] if ranking.has_noticed else None,
+        "groups_note": GROUPS_NOTE,
     }
 
 
@@ -410,9 +420,10 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     has_occlusion = "moving_occlusion" in scenario.effects.named
     setting = egvs_setting(scenario.gamma, tpog.grid.voxel_m, moving_occlusion=has_occlusion)
     return {
-        "headline": headline(ranking, bool(tpog.counts.any())),
+        "headline": headline(ranking, bool(tpog.counts.any()), scenario.score.ranking_detectors),
         "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
+        "preference": noticed_preference(ranking),
         "disagreement": ranking_disagreement(ranking.sites, setting, detectors=scenario.score.detectors),
     }
 
@@ -429,6 +440,7 @@ STAGE = Stage(
         RunFolder.scans,
         RunFolder.scores,
         RunFolder.scores_by_period,
+        RunFolder.levels,
         RunFolder.blindspots,
         RunFolder.zones,
     ),

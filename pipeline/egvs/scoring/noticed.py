@@ -1,4 +1,4 @@
-r"""What people notice in the sweeps of a sensor: a curve from simulated points to a share, for each group of road users.
+r"""What people notice in the sweeps of a sensor: curves from simulated points to a share, by group of road users.
 
 Two sensors of one junction were labelled, each by itself. Of the boxes in one list, the share that has a box within 3 m
 in the other list says how many road users people notice, by the points that the simulation, with losses of returns
@@ -95,7 +95,7 @@ class NoticeCurve:
         return self._interpolate(points, self.shares)
 
     def errors(self, points: FloatArray) -> FloatArray:
-        """Return the change of the share at each number of points (n,) by one standard error of each pool, (pools, n)."""
+        """Return the change of the share at points (n,) by one standard error of each pool, (pools, n) float64."""
         changes = [self._interpolate(points, (self.pool == k) * se) for k, se in enumerate(self.pool_se)]
         return np.array(changes).reshape(len(self.pool_se), len(points))
 
@@ -106,9 +106,7 @@ class NoticeCurve:
         return values
 
 
-def pool_adjacent_violators(
-    shares: FloatArray, standard_errors: FloatArray
-) -> tuple[FloatArray, IntArray, FloatArray]:
+def pool_adjacent_violators(shares: FloatArray, standard_errors: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
     """Return the ascending shares that fit best by weighted least squares, with the weights 1 / se^2.
 
     Parameters
