@@ -26,6 +26,7 @@ from egvs.drawing import maps, pages
 from egvs.drawing import run_figures as figures
 from egvs.drawing.basemap import network_file
 from egvs.drawing.run_figures import Figures
+from egvs.report import sensor_text
 from egvs.report.approach_fits import ApproachFit, compare_approaches
 from egvs.report.approach_map import busiest_counts, draw_approach_map
 from egvs.report.extension_sections import (
@@ -388,6 +389,7 @@ def _sensor_values(contents: PageContents) -> dict[str, Any]:
         "range_note": range_note(names, is_modelled=contents.scenario.effects.range_limit is not None),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
         "sensors_explanation": explain_differences(sensors) if sensors is not None else "",
+        "sensors_preference": sensor_text.noticed_preference(sensors) if sensors is not None else "",
         "sensors_evidence": describe_evidence(sensors) if sensors is not None else "",
     }
 

@@ -7,15 +7,13 @@ from collections.abc import Mapping, Sequence
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.wording import by_number, format_percent, list_first
 from egvs.results.labels import ScoreLabel, format_probability, join_names
+from egvs.results.levels import MIN_NOTICED_LEAD
 from egvs.results.ranking import CLOSE_SHARE, RankedSite, Ranking
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 
 MIN_RELEVANT_LEAD = 0.001
 """Poles whose scores differ by less are equally good; of shares as it is, of others relative to the best score."""
-
-MIN_NOTICED_LEAD = 0.01
-"""Shares noticed that differ by less are written alike."""
 
 _MIN_LEAD = 0.0005
 """Shares that differ by less than this look the same with one decimal."""

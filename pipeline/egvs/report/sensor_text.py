@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from egvs.results.labels import SCORE_LABELS
+from egvs.results.levels import MIN_NOTICED_LEAD
 from egvs.results.sensors import SensorComparison, difference_unit
 from egvs.results.study_results import STUDY
 from egvs.scenario.score_config import DEFAULT_SCORE
@@ -55,6 +56,24 @@ def explain_differences(comparison: SensorComparison) -> str:
     return (
         f"Differences from {comparison.baseline_name} ({kind}) are in {difference_unit(comparison.baseline.site)}, "
         f"± their standard error; ~ it is not clear which is better.{unpriced}"
+    )
+
+
+def noticed_preference(comparison: SensorComparison) -> str:
+    """Return a sentence if people would notice clearly more with another sensor than the best one; else empty."""
+    sites = [result.mount.site for result in comparison.results]
+    if sites[0].by.name != DEFAULT_SCORE:
+        return ""
+    best = max(sites, key=lambda site: site.score)
+    shares = [(site.noticed, site) for site in sites if site.noticed is not None]
+    if len(shares) < len(sites) or best.noticed is None:
+        return ""
+    most, other = max(shares, key=lambda pair: pair[0].value)
+    if other.sensor == best.sensor or most.value - best.noticed.value < MIN_NOTICED_LEAD:
+        return ""
+    return (
+        f"People would notice more with {other.sensor} ({most.cell}) than with {best.sensor} ({best.noticed.cell}); "
+        "the differences above are of what detectors should find."
     )
 
 

@@ -20,6 +20,9 @@ from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED
 MAX_SHARE_OUTSIDE = 0.1
 """With more vehicles outside the data, a share is printed as a range."""
 
+MIN_NOTICED_LEAD = 0.01
+"""Shares noticed that differ by less are taken as equal."""
+
 _RANGE_STEP = 0.05
 
 

@@ -153,8 +153,13 @@ class RankedSite:
 
     @property
     def noticed_cell(self) -> str:
-        """That share as a cell of a table."""
+        """That share as a cell of a table, without its error."""
         return "-" if self.noticed is None else self.noticed.cell
+
+    @property
+    def noticed_text(self) -> str:
+        """That share with its error."""
+        return "-" if self.noticed is None else self.noticed.text
 
     def value_of(self, name: str) -> float | None:
         """Return the value of a score; None where it was not computed, or is not defined."""
