@@ -33,7 +33,7 @@ BINS = [(low, high) for low, high in TABLE["bins"]]
 
 def with_points(kinds: tuple[str, ...], points: list[float], range_m: list[float] | None = None) -> TargetVisibility:
     """Road users with these points on them, in one frame."""
-    boxes = [(110.0 + 8.0 * i, 210.0, 1.0, 4.0, 2.0, 1.5, 0.0) for i in range(len(kinds))]
+    boxes = [(104.0 + 7.0 * i, 210.0, 1.0, 4.0, 2.0, 1.5, 0.0) for i in range(len(kinds))]
     record = TargetRecord.of([frame(boxes, kinds)], GRID, {"pedestrian", "bicycle"})
     visible = visible_targets(record, beams_to((100.0, 200.0, 3.0), [(1.0, 0.0, 0.0)]))
     assert len(visible) == len(points)
@@ -213,12 +213,14 @@ def test_columns_are_sums_over_vehicles(mini: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_groups_have_a_level_each(mini: Path, tmp_path: Path) -> None:
-    """With every third car as a bus of the same size: levels of the groups average to that of all."""
-    fcd = (mini / "fcd.csv").read_text(encoding="utf-8")
-    assert "passenger" in fcd
-    lines = fcd.splitlines()
-    changed = [line.replace("passenger", "bus") if number % 3 == 0 else line for number, line in enumerate(lines)]
-    (mini / "fcd.csv").write_text("\n".join(changed) + "\n", encoding="utf-8")
+    """With one of the two vehicles as a bus of the same size: levels of the groups average to that of all."""
+    fcd, toml = mini / "fcd.csv", mini / "scenario.toml"
+    lines = fcd.read_text(encoding="utf-8").splitlines()
+    buses = [line.replace(";car;", ";bus;") if ";west;" in line else line for line in lines]
+    fcd.write_text("\n".join(buses) + "\n", encoding="utf-8")
+    text = toml.read_text(encoding="utf-8")
+    bus = '[[traffic.kinds]]\nname = "bus"\nvclass = "bus"\nlength_m = 4.5\nwidth_m = 1.8\nheight_m = 1.5\n\n'
+    toml.write_text(text.replace("[[traffic.kinds]]", f"{bus}[[traffic.kinds]]", 1), encoding="utf-8")
     egvs.run(egvs.load(mini, ["score.rank_by=expected_detections"]), tmp_path, jobs=1)
     levels = read_artefact(tmp_path / "levels.parquet", "levels")[0].to_pylist()
     for of_all, *groups in zip(*(levels[start::3] for start in range(3)), strict=True):

@@ -73,9 +73,9 @@ def headline(ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = ())
 
     by_egvs = top.rank_by == "egvs"
     result = level(top, detectors)
-    subject = ": " if detectors else " "
     if by_egvs:
         result = f"sees {format_percent(top.entropy_seen)} of the traffic’s uncertainty"
+    of_first = f"; from {top.site}, {result}" if detectors else f": {top.site} {result}"
     if count == 1:
         return f"{top.site}, the only site{':' if detectors else ','} {result}"
     if ranking.is_tie:
@@ -84,12 +84,10 @@ def headline(ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = ())
             return text
         return f"{text}: {result}" if detectors else f"{text}: each {result}"
     if len(best) > 4:
-        return (
-            f"{top.site} and {len(best) - 1} others share first place among {count} sites: {top.site}{subject}{result}"
-        )
+        return f"{top.site} and {len(best) - 1} others share first place among {count} sites{of_first}"
     if len(best) > 1:
         names = join_names([site.site for site in best])
-        return f"{names} share first place among {count} sites: {top.site}{subject}{result}"
+        return f"{names} share first place among {count} sites{of_first}"
     text = f"{top.site} is the best of {count} sites"
     if by_egvs:
         return text
