@@ -109,18 +109,16 @@ def road_beams(sensor: Sensor) -> Beams:
     return Beams(Pose(0.0, 0.0, HEIGHT_M), sensor, length_m[:, None] * directions)
 
 
-def view_of_road(sensor: Sensor, record: TargetRecord, *, losses: bool = True) -> TargetVisibility:
-    """Return what a sensor sees of each car; without losses, every return is detected."""
-    model = ReturnModel.of(sensor)
-    probability = model.probability if losses else None
-    return visible_targets(record, road_beams(sensor), probability)
+def view_of_road(sensor: Sensor, record: TargetRecord) -> TargetVisibility:
+    """Return what a sensor sees of each car, with losses of returns."""
+    return visible_targets(record, road_beams(sensor), ReturnModel.of(sensor).probability)
 
 
-def rows() -> list[Row]:
-    """Return the table."""
+def rows(sensors: Sequence[int] = tuple(sorted(PUBLISHED))) -> list[Row]:
+    """Return the table, for sensors with these numbers of beams."""
     record = cars()
     table = []
-    for beams in sorted(PUBLISHED):
+    for beams in sensors:
         sensor = stand_in(beams)
         visible = view_of_road(sensor, record)
         by_detector, noticed = chances_by_detector(visible, DETECTORS), noticed_chances(visible)

@@ -78,8 +78,8 @@ BOTH = ("cluster", "pointpillars")
 def test_the_headline_names_whose_level_it_is() -> None:
     ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
     assert ranking_text.headline(ranked, has_traffic=True, detectors=BOTH) == (
-        "a is the best of 2 sites: detectors (cluster, pointpillars) should find 84.1 % of vehicles; people would notice "
-        "90 ± 2 % in its sweeps"
+        "a is the best of 2 sites: detectors (cluster, pointpillars) should find 84.1 % of vehicles; people would "
+        "notice 90 ± 2 % in its sweeps"
     )
     assert ranking_text.headline(with_noticed(("a", 0.841, 0.897)), has_traffic=True, detectors=("cluster",)) == (
         "a, the only site: the detector cluster should find 84.1 % of vehicles; people would notice 90 ± 2 % in its "
