@@ -123,6 +123,14 @@ def test_a_pole_from_which_people_notice_clearly_more_is_named() -> None:
     assert ranking_text.noticed_preference(by_vehicles(("a", 1.0, 0.9), ("b", 1.0, 0.8))) == ""
 
 
+def test_without_losses_the_share_noticed_is_an_upper_limit() -> None:
+    ranked = with_noticed(("a", 0.9, 0.80))
+    lossless = load(SCENARIOS / "demo", ["effects.range_limit=false"])
+    assert ranking_text.lossless_note(ranked, lossless).endswith("read that share as an upper limit.")
+    assert ranking_text.lossless_note(ranked, load(SCENARIOS / "demo")) == ""
+    assert ranking_text.lossless_note(by_vehicles(("a", 1.0, 0.9)), lossless) == ""
+
+
 def test_a_sensor_with_which_people_notice_clearly_more_is_named() -> None:
     ranked = with_noticed(("a", 0.9, 0.80), ("b", 0.8, 0.82))
     sites = [replace(site, sensor=sensor) for site, sensor in zip(ranked.sites, ("VLP-16", "OS1-64"), strict=True)]

@@ -70,6 +70,8 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     if caveats := sections.describe_caveats(scenario, "ranking", on_road, plans):
         sentences.append(caveats)
     sentences += reliability.describe_reliability(ranked, traffic_summary, scenario.score.ranking_detectors)
+    if note := ranking_text.lossless_note(ranked, scenario):
+        sentences.append(note)
     sensors = [site.sensor for site in ranked.sites]
     if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
         sentences.append(note)

@@ -37,7 +37,14 @@ from egvs.report.extension_sections import (
     section_modules,
 )
 from egvs.report.points_section import MAPPED_POLES, PointsSection
-from egvs.report.ranking_text import entropy_seen_note, headline, lead, noticed_preference, recorded_frames_hint
+from egvs.report.ranking_text import (
+    entropy_seen_note,
+    headline,
+    lead,
+    lossless_note,
+    noticed_preference,
+    recorded_frames_hint,
+)
 from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
@@ -407,11 +414,14 @@ def _cost_values(stages: Mapping[str, StageRecord]) -> dict[str, Any]:
 
 def _warning_values(contents: PageContents) -> dict[str, Any]:
     warnings = collect_warnings(stage.summary for stage in contents.stages.values())
+    reliability = describe_reliability(
+        contents.ranking, traffic_summary(contents.stages), contents.scenario.score.ranking_detectors
+    )
+    if note := lossless_note(contents.ranking, contents.scenario):
+        reliability.append(note)
     return {
         "warnings": warnings,
-        "reliability": describe_reliability(
-            contents.ranking, traffic_summary(contents.stages), contents.scenario.score.ranking_detectors
-        ),
+        "reliability": reliability,
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 
