@@ -63,7 +63,7 @@ EIGHTY_BEAMS = SensorConfig(
 STAND_INS = {16: "VLP-16", 32: "VLP-32C", 80: "80 beams", 128: "RS-Ruby Plus"}
 
 CENTERPOINT, SECOND = "CenterPoint", "SECOND"
-PUBLISHED = {
+PUBLISHED: dict[int, dict[str, tuple[float | None, ...]]] = {
     128: {CENTERPOINT: (0.90, 0.90, 1.00, 0.99), SECOND: (0.90, 0.91, 1.00, 0.97)},
     80: {CENTERPOINT: (0.88, 0.90, 0.93, 0.90), SECOND: (0.93, 0.95, 0.98, 0.89)},
     32: {CENTERPOINT: (0.87, 0.79, 0.67, None), SECOND: (0.89, 0.83, 0.83, None)},

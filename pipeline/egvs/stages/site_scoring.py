@@ -205,10 +205,12 @@ class TargetScorer:
         """
         if self._groups is None:
             return {}
-        further = {DEFAULT_SCORE: detector_groups(len(self.detectors)), NOTICED: curve_groups(noticed_pools())}
-        names = {score: score for score in further}
-        names |= {group_score(score, group): score for score in further for group in self.levels}
-        return {name: further[score] for name, score in names.items()}
+        further: dict[str, tuple[BlockGroups, ...]] = {
+            DEFAULT_SCORE: detector_groups(len(self.detectors)),
+            NOTICED: curve_groups(noticed_pools()),
+        }
+        of_groups = {group_score(score, group): further[score] for score in further for group in self.levels}
+        return further | of_groups
 
     def weights_by_period(self) -> dict[str, FloatArray]:
         """Return the weight of each vehicle-frame in each period alone, (n,) float64; nothing without periods."""
@@ -228,12 +230,14 @@ class TargetScorer:
                 values[name] = by_detector.mean(axis=0)
             else:
                 values[name] = TARGET_SCORES[name](visible, self.detectors)
-        parts = {}
+        parts: dict[str, FloatArray] = {}
         if by_detector is not None:
             parts[DEFAULT_SCORE] = by_detector
         if NOTICED in values:
             parts[NOTICED] = noticed_errors(visible)
-        scores = {name: self._replicates(name, vehicle_values, parts) for name, vehicle_values in values.items()}
+        scores: dict[str, FloatArray] = {}
+        for name, vehicle_values in values.items():
+            scores[name] = self._replicates(name, vehicle_values, parts)
         scores |= self._level_scores(visible, values, parts)
 
         by_period = []
@@ -251,14 +255,15 @@ class TargetScorer:
         self, visible: VisibleTargets, values: Mapping[str, FloatArray], parts: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
         """Return what detectors find and people notice of each group of road users, with bounds of the latter."""
-        scores = {}
+        scores: dict[str, FloatArray] = {}
+        bounds = dict(zip(NOTICED_BOUNDS, noticed_bounds(visible), strict=True))
         for group, members in self.levels.items():
-            for name in (DEFAULT_SCORE, NOTICED):
-                if group != ALL_USERS:
-                    scores[group_score(name, group)] = self._replicates(name, values[name], parts, members)
-            bounds = noticed_bounds(visible)
-            for name, bound in zip(NOTICED_BOUNDS, bounds, strict=True):
+            for name, bound in bounds.items():
                 scores[group_score(name, group)] = np.array([weighted_mean(bound, self.weight * members)])
+            if group == ALL_USERS:  # the scores of the run
+                continue
+            for score in (DEFAULT_SCORE, NOTICED):
+                scores[group_score(score, group)] = self._replicates(score, values[score], parts, members)
         return scores
 
     def _replicates(
@@ -291,7 +296,9 @@ class TargetScorer:
         if not self.score_groups.get(name):
             return means
         of_parts = np.array([weighted_mean(part, weight) for part in parts[name]])
-        return np.append(means, means_without_each(of_parts) if name == DEFAULT_SCORE else means[0] + of_parts)
+        if name == DEFAULT_SCORE:
+            return np.append(means, means_without_each(of_parts))
+        return np.append(means, means[0] + of_parts)
 
     def _period_mean(self, values: FloatArray, rows: slice) -> float:
         weight = None if self._configured_weight is None else self._configured_weight[rows]
