@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 
 Floats = FloatArray
 
-ByReflectivity = Callable[[FloatArray, FloatArray], FloatArray]
-"""Probability (n,) by range (n,), in metres, and by reflectivity (n,)."""
+ByRange = Callable[[FloatArray], FloatArray]
+"""Probability (n,) by range (n,), in metres."""
 
 SEEN_WELL_POINTS = 20.0
 """n0: the gain of a vehicle with this many points is 63 %, with three times as many 95 %."""
@@ -390,9 +390,7 @@ class VisibleTargets(TargetVisibility):
     sensor_m: FloatArray
 
 
-def visible_targets(
-    record: TargetRecord, beams: Beams, return_probability: ByReflectivity | None = None
-) -> VisibleTargets:
+def visible_targets(record: TargetRecord, beams: Beams, return_probability: ByRange | None = None) -> VisibleTargets:
     """Return what a site sees of the vehicle-frames of a record.
 
     Parameters
@@ -402,8 +400,8 @@ def visible_targets(
     beams
         The site's empty scan.
     return_probability
-        Probability that returns are detected, by range (n,) and reflectivity (n,), as
-        :class:`egvs.effects.returns.ReturnProbability`; 1 where it is None.
+        Probability that a return from each range (n,) is detected; 1 where it is None. With losses, a
+        :class:`egvs.effects.returns.ReturnProbability`, which also depends on the reflectivity of each vehicle.
     """
     row, boxes = record.row, record.all_boxes.values[record.row]
     yaw_rad = boxes[:, 3]
@@ -415,8 +413,10 @@ def visible_targets(
 
     hits = _count_points(record, sensor_m, beams, return_probability)
     points_alone = hits.alone[row]
-    if return_probability is not None:
+    if isinstance(return_probability, ReturnProbability):
         points_alone = points_alone * return_probability(range_m, record.reflectivity)
+    elif return_probability is not None:
+        points_alone = points_alone * return_probability(range_m)
     bounds_m, slices = np.stack([hits.low[row], hits.high[row]], axis=1), hits.slices[row]
     misses = None if hits.misses is None else hits.misses[row]
     spans, hole_m = spans_and_holes(record, bounds_m, slices, misses)
@@ -537,7 +537,7 @@ class Losses(NamedTuple):
     misses: NDArray[np.float32]
 
     @classmethod
-    def of(cls, record: TargetRecord, return_probability: ByReflectivity, farthest_m: float) -> Losses:
+    def of(cls, record: TargetRecord, return_probability: ReturnProbability, farthest_m: float) -> Losses:
         """Tabulate the probability of returns up to a range, for each reflectivity of the record."""
         reflectivity, row = np.unique(record.reflectivity, return_inverse=True)
         range_m = np.arange(math.ceil(farthest_m * _STEPS_PER_M) + 2) / _STEPS_PER_M
@@ -556,12 +556,15 @@ NO_LOSSES = Losses(
 
 
 def _count_points(
-    record: TargetRecord, sensor_m: FloatArray, site: Beams, return_probability: ByReflectivity | None
+    record: TargetRecord, sensor_m: FloatArray, site: Beams, return_probability: ByRange | None
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
-    thins_spans = isinstance(return_probability, ReturnProbability) and return_probability.thins_spans
-    is_listed = return_probability is not None and not thins_spans
-    beams = sort_beams(site, 1 if is_listed or site.weight is not None else _BANDS)
+    losses = NO_LOSSES
+    if isinstance(return_probability, ReturnProbability) and return_probability.thins_spans:
+        farthest_m = math.sqrt(float((site.ends_m**2).sum(axis=1).max(initial=0.0)))
+        losses, return_probability = Losses.of(record, return_probability, farthest_m), None
+    is_counted = site.weight is None and return_probability is None
+    beams = sort_beams(site, _BANDS if is_counted else 1)
     is_target = np.zeros(count, dtype=np.bool_)
     is_target[record.row] = True
     size_m = np.asarray(record.grid.roi.size_m)
@@ -570,12 +573,9 @@ def _count_points(
     bounds = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     sums = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds
     nearest_m = beams.length_m.copy()
-    losses, capacity, reflectivity = NO_LOSSES, 0, np.zeros(count)
-    if return_probability is not None and thins_spans:
-        losses = Losses.of(record, return_probability, float(beams.length_m.max(initial=0.0)))
-    elif return_probability is not None:
+    capacity = 0
+    if return_probability is not None:
         capacity = max(MAX_HITS, len(beams.length_m))
-        reflectivity[record.row] = record.reflectivity
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
     frame = 0
@@ -583,11 +583,11 @@ def _count_points(
         frame, filled = vehicle_visibility.first_hits(
             frame, sensor_m, size_m, all_boxes, tuple(beams), nearest_m, tuple(losses), sums, hits
         )
-        if is_listed and return_probability is not None:
+        if return_probability is not None:
             box, row, hit_range_m, along_m, across_m = (column[:filled] for column in hits)
-            weight = beams.weight[row] * return_probability(hit_range_m, reflectivity[box])
+            weight = beams.weight[row] * return_probability(hit_range_m)
             vehicle_visibility.accumulate_hits(box, weight, along_m, across_m, boxes.values, sums[1:])
-    return _BoxHits(*sums, losses.misses if thins_spans else None)
+    return _BoxHits(*sums, None if losses is NO_LOSSES else losses.misses)
 
 
 class SortedBeams(NamedTuple):

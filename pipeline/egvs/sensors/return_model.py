@@ -38,7 +38,7 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Roi
-from egvs.core.special import ndtr
+from egvs.core.special import cosdg, ndtr
 from egvs.scenario.effects_config import RangeLimitParameters
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Site
@@ -176,7 +176,7 @@ class ReturnModel:
 
     def limit_m(self, reflectivity: float) -> float:
         """Return the range at which a target is detected with a probability of 1/2, apart from dropout, metres."""
-        cosine = math.cos(math.radians(self.incidence_deg))
+        cosine = float(cosdg(self.incidence_deg)) if self.incidence_deg else 1.0
         return self.rated_range_m * math.sqrt(reflectivity * cosine / self.rated_reflectivity)
 
     def probability(self, range_m: FloatArray, reflectivity: float | FloatArray | None = None) -> FloatArray:
