@@ -39,6 +39,7 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Roi
 from egvs.core.special import cosdg, ndtr
+from egvs.core.wording import format_percent
 from egvs.scenario.effects_config import RangeLimitParameters
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Site
@@ -224,20 +225,27 @@ class LossDecision:
     unrated: tuple[str, ...]
 
     @property
+    def negligible_note(self) -> str:
+        """Why sensors have no losses."""
+        share = format_percent(NEGLIGIBLE_LOSS, 0)
+        return f"not called for: {', '.join(self.negligible)} lose at most {share} of returns from the region"
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What was decided: a line for sensors with losses, and one for sensors without a rated range."""
         notes = []
         if self.acting:
-            listed = ", ".join(f"{name} ({limit:.0f} m)" for name, (_, limit) in self.acting.items())
             reach_m = max(reach for reach, _ in self.acting.values())
+            listed = ", ".join(f"{name} ({limit:.0f} m)" for name, (_, limit) in self.acting.items())
             notes.append(
-                f"losses of returns: on for {listed}: the region reaches to {reach_m:.0f} m, beyond the range without "
-                "noticeable losses (effects.range_limit = false: off)"
+                f"losses of returns are simulated for {listed}: the region reaches to {reach_m:.0f} m, farther than "
+                f"the range in brackets, where {format_percent(NEGLIGIBLE_LOSS, 0)} are lost (effects.range_limit = "
+                "false: off)"
             )
         for name in self.unrated:
             notes.append(
-                f"losses of returns: off for {name}, which has no rated range: every return is assumed to be detected. "
-                f"Enter rated_range_m and rated_reflectivity under [sensors.{name}]"
+                f"losses of returns are not simulated for {name}, which has no rated range: every return is assumed to "
+                f"be detected. Enter rated_range_m and rated_reflectivity under [sensors.{name}]"
             )
         return tuple(notes)
 
