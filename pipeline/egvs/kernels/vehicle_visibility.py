@@ -49,7 +49,7 @@ SLICES = 64
 NEGLIGIBLE_CHANCE = 1e-4
 """Gaps that are rarer than this are not added up."""
 
-MANY_POINTS = 16.0
+MANY_POINTS = 128.0
 """From this expected number of points on a vehicle, their extent is that of all beams which meet it."""
 
 _SHARE_UNIT = 2.0**30
@@ -58,7 +58,7 @@ _SHARE_UNIT = 2.0**30
 SHARE_TOLERANCE = 1e-3
 """Largest difference between a share of returns and its parabola over a vehicle."""
 
-MAX_STEP_CHANGE = 1.0
+MAX_STEP_CHANGE = 2.0
 """Chances of gaps are interpolated over steps with at most this number of slices times the change of the chance."""
 
 _ON_SIDE_M = 1e-6
@@ -372,21 +372,24 @@ def _parabola(by_range, near, far):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _weigh_box_hits(b, box, directions, runs, nearest_m, t_m, loss, sums):  # type: ignore[no-untyped-def]
+def _box_parabola(box, by_range, per_m):  # type: ignore[no-untyped-def]
+    """Coefficients of the share of returns over a box, the step of range that they count from, and their error."""
+    away = math.sqrt(box[3] * box[3] + box[8] * box[8] + box[13] * box[13]) * per_m
+    reach = math.sqrt(box[4] * box[4] + box[9] * box[9] + box[14] * box[14]) * per_m
+    near, far = max(away - reach, 0.0), away + reach
+    c0, c1, c2, error = _parabola(by_range, near, far)
+    return (c0, c1, c2, 0.5 * (near + far)), error
+
+
+@_kernel
+def _weigh_box_hits(b, box, directions, runs, nearest_m, t_m, parabola, per_m, sums):  # type: ignore[no-untyped-def]
     """Fill the sums of :func:`first_hits` for box b, where each beam counts the share of its return that is detected.
 
-    The share is a parabola of range over the box. Returns whether that is exact enough.
+    The share is a ``parabola`` of :func:`_box_parabola`.
     """
-    shares, share_row, per_m = loss[0], loss[1], loss[2]
+    c0, c1, c2, middle = parabola
     ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
     bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
-    away = math.sqrt(ao * ao + bo * bo + box[13] * box[13]) * per_m
-    reach = math.sqrt(ah * ah + bh * bh + box[14] * box[14]) * per_m
-    near, far = max(away - reach, 0.0), away + reach
-    c0, c1, c2, error = _parabola(shares[share_row[b]], near, far)
-    if error > SHARE_TOLERANCE:
-        return False
-    middle = 0.5 * (near + far)
     units, side_units, parts, done = np.int64(0), np.int64(0), np.uint64(0), 0  # sums of integers are vectorised
     a_low, a_high, b_low, b_high = _LARGEST_KEY, -_LARGEST_KEY, _LARGEST_KEY, -_LARGEST_KEY
     for r in range(runs.shape[0]):
@@ -411,7 +414,22 @@ def _weigh_box_hits(b, box, directions, runs, nearest_m, t_m, loss, sums):  # ty
         total[b], sides[b], slices[b] = units / _SHARE_UNIT, side_units / _SHARE_UNIT, parts
         low[b, 0], high[b, 0] = _key_value(a_low), _key_value(a_high)
         low[b, 1], high[b, 1] = _key_value(b_low), _key_value(b_high)
-    return True
+
+
+@_kernel
+def _miss_slices(box, directions, rows, nearest_m, parabola, per_m, misses):  # type: ignore[no-untyped-def]
+    """Multiply the misses (2, SLICES) of a box by the probability that the returns of the beams ``rows`` are lost."""
+    c0, c1, c2, middle = parabola
+    ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
+    bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
+    x, y, z = directions[0], directions[1], directions[2]
+    by_length, by_width = misses[0], misses[1]
+    for n in rows:
+        t = nearest_m[n]
+        steps = t * per_m - middle
+        miss = np.float32(1.0 - min(max(c0 + steps * (c1 + steps * c2), 0.0), 1.0))
+        by_length[_slice_of(ao + t * (ax * x[n] + ay * y[n] + az * z[n]), ah)] *= miss
+        by_width[_slice_of(bo + t * (bx * x[n] + by * y[n] + bz * z[n]), bh)] *= miss
 
 
 @_kernel
@@ -571,16 +589,23 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, loss, sums, hits):  # 
             if listed[b] and weight.shape[0] == 0 and loss[0].shape[0] == 0:
                 _count_box_hits(b, facing[k], directions, box_runs, nearest_m, box_t_m, added)
             elif listed[b]:
-                has_losses = loss[0].shape[0] > 0
+                has_losses, is_smooth, parabola = loss[0].shape[0] > 0, False, (0.0, 0.0, 0.0, 0.0)
                 if has_losses and weight.shape[0] == 0:
-                    is_exact = _weigh_box_hits(b, facing[k], directions, box_runs, nearest_m, box_t_m, loss, added)
-                    if is_exact and (added[0][b] >= MANY_POINTS or added[0][b] == 0.0):
-                        loss[3][b] = -1
-                        if ties > 0:
-                            _take_beams(box_runs, nearest_m, box_t_m)
-                        continue
-                box_rows = rows[: _list_rows(box_runs, nearest_m, box_t_m, rows)]
-                if has_losses:
+                    parabola, error = _box_parabola(facing[k], loss[0][loss[1][b]], loss[2])
+                    is_smooth = error <= SHARE_TOLERANCE
+                if is_smooth:
+                    _weigh_box_hits(b, facing[k], directions, box_runs, nearest_m, box_t_m, parabola, loss[2], added)
+                is_certain = is_smooth and (added[0][b] >= MANY_POINTS or added[2][b] == np.uint64(0))
+                if is_certain:
+                    loss[3][b] = -1
+                    box_rows = rows[:0]
+                else:
+                    box_rows = rows[: _list_rows(box_runs, nearest_m, box_t_m, rows)]
+                if is_smooth:
+                    _miss_slices(
+                        facing[k], directions, box_rows, nearest_m, parabola, loss[2], loss[4][max(loss[3][b], 0)]
+                    )
+                elif has_losses:
                     _thin_box_hits(b, facing[k], directions, box_rows, nearest_m, weight, loss, added)
                 elif room > 0:
                     count = _list_box_hits(b, facing[k], directions, box_rows, nearest_m, hits, count)
@@ -689,7 +714,7 @@ def _chance_of_gap(miss, part, count, gap, ends):  # type: ignore[no-untyped-def
     none_before = 1.0
     for s in range(count):
         reached, empty, before = none_before, 1.0, s - 1
-        while before >= 0 and part[s] - part[before] <= gap:
+        while before >= 0 and part[s] - part[before] <= gap and empty > NEGLIGIBLE_CHANCE:
             reached += ends[before] * empty
             empty *= miss[before]
             before -= 1
