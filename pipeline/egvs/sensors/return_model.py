@@ -224,6 +224,10 @@ class LossDecision:
     negligible: Mapping[str, tuple[float, float]]
     unrated: tuple[str, ...]
 
+    def to_json(self) -> dict[str, list[str]]:
+        """Return the names of the sensors by decision, for the summary of a stage."""
+        return {"on": list(self.acting), "negligible": list(self.negligible), "unrated": list(self.unrated)}
+
     @property
     def negligible_note(self) -> str:
         """Why sensors have no losses."""
