@@ -52,6 +52,10 @@ CAR = "car"
 REFLECTIVITY_INTERVAL = (0.03, 0.06)
 """Reflectivities that two units give, each by itself: the interval of the default."""
 
+GLASS_RATIO = 0.75
+"""Reflectivity of windows over that of the whole vehicle: the OS1-64 loses 71 % of the pulses that meet windows of cars
+and 61 % of all that meet cars, which is 0.28 standard deviations of the logarithm of power; exp(-0.28 s), s = 1."""
+
 NEGLIGIBLE_LOSS = 0.05
 """Losses by range are simulated if they are larger than this anywhere in the region; the fit leaves 0.1."""
 
@@ -85,6 +89,16 @@ class RoadUserClass:
     glass_share: float
     source: str
     vclasses: tuple[str, ...]
+
+    @property
+    def glass_reflectivity(self) -> float:
+        """Reflectivity of its windows."""
+        return self.reflectivity * GLASS_RATIO
+
+    @property
+    def body_reflectivity(self) -> float:
+        """Reflectivity of the rest: the geometric mean with that of windows, by their shares, is ``reflectivity``."""
+        return float(self.reflectivity * GLASS_RATIO ** (-self.glass_share / (1.0 - self.glass_share)))
 
 
 @cache
