@@ -11,13 +11,12 @@ Nothing here depends on a page or a browser. World frame, metres.
 
 from __future__ import annotations
 
-from collections.abc import json
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import Mapping
 import numpy as np
-import Sequence
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet, traffic_frames
