@@ -26,7 +26,7 @@ from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import by_number, number_of
 from egvs.report import ranking_text, reliability, sections
 from egvs.report.extension_sections import read_sections
-from egvs.report.sensor_text import range_note
+from egvs.report.sensor_text import has_losses, range_note
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
 from egvs.results.ranking import Pole, RankedSite, Ranking
 from egvs.scenario.model import Scenario
@@ -73,7 +73,7 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     if note := ranking_text.lossless_note(ranked, scenario):
         sentences.append(note)
     sensors = [site.sensor for site in ranked.sites]
-    if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
+    if note := range_note(sensors, is_modelled=has_losses(scenario, sensors)):
         sentences.append(note)
     print_sentences(sentences)
     if ranked.best[0].score > 0 and len(set(sensors)) == 1:

@@ -37,6 +37,7 @@ from egvs.results.levels import GROUPS_NOTE, GroupLevel, read_levels
 from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pole
 from egvs.scenario.effects_config import RangeLimitParameters
 from egvs.scenario.score_config import ALL_DETECTORS, DEFAULT_SCORE, NOTICED
+from egvs.sensors.return_model import NEGLIGIBLE_LOSS, ReturnModel
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
@@ -344,7 +345,7 @@ def print_sensors(sensors: Iterable[Sensor]) -> None:
             "range: no beam is longer. rated: how far the maker's sensor still detects a target of this reflectivity; "
             f"the last column converts it to {format_percent(DARK_REFLECTIVITY, 0)} (dark vehicles), so "
             "that sensors can be compared. "
-            "Scores use it only with --set effects.range_limit={}.",
+            "Losses of returns follow from it, where they can change a result: docs/effects.md.",
             "The catalogue has no prices, and does not say which sensors are still sold. Set prices with "
             "--set 'costs.sensor={\"NAME\" = PRICE}' or in [costs].",
             "egvs sensors NAME prints sources and assumptions; egvs compare SCENARIO --sensors NAME,NAME compares.",
@@ -376,6 +377,15 @@ def print_sensor_details(sensors: Iterable[Sensor]) -> None:
             f"{sensor.range_sigma_m:g} m",
             f"  source: {sensor.source}",
         ]
+        if sensor.rated_range_m is not None:
+            model = ReturnModel.of(sensor)
+            lines.append(
+                f"  losses of returns from cars: half are lost at {model.limit_m(model.target_reflectivity()):.0f} m, "
+                f"{format_percent(NEGLIGIBLE_LOSS, 0)} at {model.lossless_range_m:.0f} m, and "
+                f"{format_percent(model.dropout, 0)} at any range (reflectivity {model.target_reflectivity():g}, "
+                f"softness {model.softness:g}: fitted on two units); rated range: "
+                f"{sensor.rated_source or 'the scenario'}"
+            )
         if sensor.assumed:
             lines.append(f"  assumed: {sensor.assumed}")
         print_sentences(lines)

@@ -18,7 +18,14 @@ from rich.table import Table
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table, percent_or_dash, print_sentences
 from egvs.core.wording import format_percent, list_first
-from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, noticed_preference, range_note
+from egvs.report.sensor_text import (
+    costs_option,
+    describe_evidence,
+    describe_losses,
+    explain_differences,
+    noticed_preference,
+    range_note,
+)
 from egvs.results.labels import SCORE_LABELS, join_names
 from egvs.results.ranking import RankedSite, share_of_limit
 from egvs.results.sensors import (
@@ -261,10 +268,10 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
         option = costs_option(sensors.sensors if not sensors.has_costs else sensors.unpriced)
         hint = f"What one more point costs: {shlex.join(words)} {option}, or [costs] in scenario.toml"
         out.print(hint, soft_wrap=True)  # a command that is broken into lines cannot be copied
-    is_modelled = all(run.has_range_limit for run in comparison.runs)
+    is_modelled = all(run.has_losses for run in comparison.runs)
     if note := range_note(sensors.sensors, is_modelled=is_modelled):
         print_sentences([note])
-    print_sentences([describe_evidence(sensors)])
+    print_sentences([describe_evidence(sensors), describe_losses(has_interval=sensors.has_loss_interval)])
     out.print()
 
 

@@ -64,10 +64,11 @@ from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.effects.base import Echo, Echoes
-from egvs.effects.returns import ReturnProbability, reflectivity_of
+from egvs.effects.returns import ReturnProbability
 from egvs.formats import meshes
 from egvs.kernels import mesh_casting
 from egvs.scenario.model import Scenario
+from egvs.sensors.return_model import class_of
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor
@@ -552,10 +553,14 @@ class CloudSimulator:
         """Return the rows whose return is detected, drawn by the probability that effects give it."""
         if self._return_probability is None:
             return rows
-        owner = hits.owner[rows]
+        owner, triangle = hits.owner[rows], hits.triangle[rows]
         on_body = owner >= 0
         reflectivity: FloatArray = hits.intensity[rows].astype(np.float64)  # of the static world, times the cosine
-        reflectivity[on_body] = reflectivity_of(frame.kinds)[owner[on_body]]
+        classes = [class_of(vclass) for vclass in frame.kinds]
+        body = np.array([road_users.body_reflectivity for road_users in classes])
+        glass = np.array([road_users.glass_reflectivity for road_users in classes])
+        is_glass = self._bodies.surfaces[triangle[on_body]] == "glass"
+        reflectivity[on_body] = np.where(is_glass, glass[owner[on_body]], body[owner[on_body]])
         probability = self._return_probability(hits.range_m[rows], reflectivity)
         return rows[rng.random(len(rows)) < probability]
 

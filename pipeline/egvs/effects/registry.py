@@ -82,10 +82,11 @@ def scenario_effects(scenario: Scenario, *stages: str) -> tuple[base.Effect[Any]
     return tuple(effect for effect in effects if effect.STAGE in stages)
 
 
-def make_losses(sensors: Iterable[str]) -> base.Effect[Any]:
-    """Return the losses of returns of some sensors, by name, with the sensors' values."""
+def make_losses(sensors: Iterable[str] | None) -> base.Effect[Any]:
+    """Return the losses of returns of some sensors, by name, or of all for None, with the sensors' values."""
     effect_class = load_effect_class(LOSSES)
-    return effect_class(effect_class.Model(), frozenset(sensors))  # type: ignore[call-arg]
+    names = None if sensors is None else frozenset(sensors)
+    return effect_class(effect_class.Model(), names)  # type: ignore[call-arg]
 
 
 def effect_modules(effects: Iterable[base.Effect[Any]]) -> tuple[str, ...]:

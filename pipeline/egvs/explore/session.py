@@ -11,6 +11,7 @@ Nothing here depends on a page or a browser. World frame, metres.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,6 +33,7 @@ from egvs.clouds import simulation as cloud_simulation
 from egvs.clouds.simulation import CloudSimulator, VehicleMeshes, sweep_rng
 from egvs.core.errors import Diagnostic, InputError, choose_one
 from egvs.core.grid import Grid
+from egvs.effects import registry
 from egvs.effects.returns import ReturnProbability
 from egvs.placement import problem_builder
 from egvs.placement.refinement import PlanPoses
@@ -440,7 +442,7 @@ class Session:
         """Return scanner and scorer with the effects that act when a candidate is moved to ``site``."""
         sites = tuple(site if other.name == site.name else other for other in self.scene.sites)
         scene = scene_inputs.with_effects(replace(self.scene, sites=sites, effects=(), inactive_effects=()))
-        key = tuple(effect.NAME for effect in scene.effects)
+        key = json.dumps(registry.effect_settings(scene.effects))
         if key not in self.engines:
             scene = replace(scene, sites=())  # one scanner for all poses
             self.engines[key] = Engine(scene, Scanner(scene, mounts=1), self._make_scorer(scene))

@@ -52,7 +52,8 @@ class Settings:
     @classmethod
     def from_scenario(cls, scenario: Scenario) -> Settings:
         """Return the settings of a scenario."""
-        return cls(None, scenario.score.rank_by, frozenset(scenario.effects.named))
+        losses = () if scenario.effects.range_limit is False else (registry.LOSSES,)
+        return cls(None, scenario.score.rank_by, frozenset((*scenario.effects.named, *losses)))
 
     def apply(self, scenario: Scenario, where: str = "") -> Scenario:
         """Return a scenario with these settings.
@@ -76,7 +77,13 @@ class Settings:
             values["score"]["gamma"] = "inf" if math.isinf(self.gamma) else self.gamma
         values["score"]["rank_by"] = self.rank_by
         named = values["effects"]
-        values["effects"] = {name: named.get(name, trial_parameters(name)) for name in sorted(self.effects)}
+        values["effects"] = {
+            name: named.get(name) or trial_parameters(name)
+            for name in sorted(self.effects)
+            if name != registry.LOSSES or scenario.effects.range_limit is not None  # else it acts by itself
+        }
+        if registry.LOSSES not in self.effects:
+            values["effects"][registry.LOSSES] = False
         return scenario_from_dict(values, scenario.folder, where or str(scenario.file))
 
     def overrides(self, scenario: Scenario) -> tuple[str, ...]:
@@ -91,7 +98,7 @@ class Settings:
             parameters = ", ".join(f"{key}={value}" for key, value in trial_parameters(name).items())
             overrides.append(f"effects.{name}={{{parameters}}}")
         for name in sorted(unchanged.effects - self.effects):
-            overrides.append(f"without effects.{name}")
+            overrides.append("effects.range_limit=false" if name == registry.LOSSES else f"without effects.{name}")
         return tuple(overrides)
 
 

@@ -57,7 +57,7 @@ from egvs.report.sections import (
     ranking_disagreement,
     study_values,
 )
-from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, range_note
+from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, has_losses, range_note
 from egvs.report.signal_diagram import signal_diagrams
 from egvs.report.what_if_section import WhatIfSection
 from egvs.report.zone_section import ZoneSection
@@ -104,7 +104,7 @@ _UNMODELLED = (
     ("occlusion between vehicles (in the EGVS)", "moving_occlusion"),
     ("rain", "rain"),
     ("fog", "fog"),
-    ("attenuation of beams with distance", "range_limit"),
+    ("losses of returns by distance", "range_limit"),
     ("partly transparent foliage", "foliage"),
     ("pedestrians and cyclists", "pedestrians_bicycles"),
     ("dirt and glare", ""),
@@ -367,6 +367,9 @@ def _ranking_values(ranking: Ranking) -> dict[str, Any]:
 def _setting_values(contents: PageContents) -> dict[str, Any]:
     scenario = contents.scenario
     effects, gamma = list(scenario.effects.named), scenario.gamma
+    modelled = set(effects)
+    if contents.stages["score"].summary.get("losses"):
+        modelled.add("range_limit")
     frames = contents.tpog.frames
     if contents.by_period is not None:
         frames = contents.by_period.frames
@@ -383,7 +386,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
         "frames": frames,
         "duration": formatting.format_duration(frames * scenario.traffic.frame_period_s),
         "effects": effects,
-        "unmodelled": [name for name, effect in _UNMODELLED if effect not in effects],
+        "unmodelled": [name for name, effect in _UNMODELLED if effect not in modelled],
     }
 
 
@@ -393,7 +396,7 @@ def _sensor_values(contents: PageContents) -> dict[str, Any]:
     names = [site.sensor for site in contents.ranking.sites]
     return {
         "sensors": sensors,
-        "range_note": range_note(names, is_modelled=contents.scenario.effects.range_limit is not None),
+        "range_note": range_note(names, is_modelled=has_losses(contents.scenario, names)),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
         "sensors_explanation": explain_differences(sensors) if sensors is not None else "",
         "sensors_preference": sensor_text.noticed_preference(sensors) if sensors is not None else "",

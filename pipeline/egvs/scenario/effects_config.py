@@ -244,8 +244,11 @@ class EffectsConfig(StrictModel):
         return self.model_validate(kept)
 
     def without(self, name: str) -> Self:
-        """Return the named effects except one."""
-        return self.only(*(other for other in self.named if other != name))
+        """Return the named effects except one, which is off."""
+        others: dict[str, Any] = {other: value for other, value in self.named.items() if other != name}
+        if name == "range_limit" or self.range_limit is False:
+            others["range_limit"] = False  # None would let it act where it can change a result
+        return self.model_validate(others)
 
     @model_validator(mode="after")
     def _check_plugins(self) -> Self:

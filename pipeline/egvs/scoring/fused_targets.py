@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
-from egvs.scoring.targets import TargetVisibility, slice_misses, spans_and_holes
+from egvs.scoring.targets import SliceMisses, TargetVisibility, slice_misses, spans_and_holes
 
 
 def fuse_targets(views: Sequence[TargetVisibility]) -> TargetVisibility:
@@ -82,13 +82,13 @@ def fuse_targets(views: Sequence[TargetVisibility]) -> TargetVisibility:
     )
 
 
-def _fused_misses(views: Sequence[TargetVisibility]) -> NDArray[np.float32] | None:
+def _fused_misses(views: Sequence[TargetVisibility]) -> SliceMisses | None:
     """Return the probability that a slice has no point of any sensor; None if no sensor loses returns."""
     if all(view.misses is None for view in views):
         return None
-    misses = [slice_misses(view) for view in views]
-    fused: NDArray[np.float32] = np.multiply.reduce(np.sort(misses, axis=0), axis=0)
-    return fused
+    misses = np.sort([slice_misses(view) for view in views], axis=0)
+    fused: NDArray[np.float32] = np.multiply.reduce(misses, axis=0)
+    return SliceMisses(np.arange(len(fused)), fused)
 
 
 def _best_views(views: Sequence[TargetVisibility]) -> IntArray:

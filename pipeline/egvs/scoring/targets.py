@@ -60,8 +60,8 @@ if TYPE_CHECKING:
 
 Floats = FloatArray
 
-ByReflectivity = Callable[[FloatArray, FloatArray], FloatArray]
-"""Probability (n,) by range (n,), in metres, and by reflectivity (n,)."""
+ByRange = Callable[[FloatArray], FloatArray]
+"""Probability (n,) by range (n,), in metres."""
 
 SEEN_WELL_POINTS = 20.0
 """n0: the gain of a vehicle with this many points is 63 %, with three times as many 95 %."""
@@ -318,6 +318,21 @@ def _neighbour_gaps(boxes: AllBoxes, row: IntArray) -> FloatArray:
     return gap_m[row]
 
 
+class SliceMisses(NamedTuple):
+    """Probability that slices of vehicles have no point.
+
+    Attributes
+    ----------
+    rows
+        The vehicle-frames, (k,) int64. Points on any other extend as far as the beams that meet it.
+    misses
+        Of the slices of the length, and of the width, (k, 2, 64) float32.
+    """
+
+    rows: IntArray
+    misses: NDArray[np.float32]
+
+
 @dataclass(frozen=True, eq=False)
 class TargetVisibility:
     """What one sensor, or several together, see of the vehicle-frames of a record, row by row, n of them.
@@ -354,8 +369,8 @@ class TargetVisibility:
         Which of the 64 equal slices of the vehicle's length, from the rear, have a point of any probability: one bit
         each, (n,) uint64.
     misses
-        With losses of returns, the probability that a slice has no point: of the length, and of the width, (n, 2, 64)
-        float32; None without.
+        With losses of returns, the probability that slices have no point, for vehicles of which that matters; None
+        without.
     """
 
     record: TargetRecord
@@ -370,7 +385,7 @@ class TargetVisibility:
     side: FloatArray
     bounds_m: FloatArray
     slices: NDArray[np.uint64]
-    misses: NDArray[np.float32] | None
+    misses: SliceMisses | None
 
     def __len__(self) -> int:
         """Number of vehicle-frames."""
@@ -390,9 +405,7 @@ class VisibleTargets(TargetVisibility):
     sensor_m: FloatArray
 
 
-def visible_targets(
-    record: TargetRecord, beams: Beams, return_probability: ByReflectivity | None = None
-) -> VisibleTargets:
+def visible_targets(record: TargetRecord, beams: Beams, return_probability: ByRange | None = None) -> VisibleTargets:
     """Return what a site sees of the vehicle-frames of a record.
 
     Parameters
@@ -402,8 +415,8 @@ def visible_targets(
     beams
         The site's empty scan.
     return_probability
-        Probability that returns are detected, by range (n,) and reflectivity (n,), as
-        :class:`egvs.effects.returns.ReturnProbability`; 1 where it is None.
+        Probability that a return from each range (n,) is detected; 1 where it is None. With losses, a
+        :class:`egvs.effects.returns.ReturnProbability`, which also depends on the reflectivity of each vehicle.
     """
     row, boxes = record.row, record.all_boxes.values[record.row]
     yaw_rad = boxes[:, 3]
@@ -415,10 +428,12 @@ def visible_targets(
 
     hits = _count_points(record, sensor_m, beams, return_probability)
     points_alone = hits.alone[row]
-    if return_probability is not None:
+    if isinstance(return_probability, ReturnProbability):
         points_alone = points_alone * return_probability(range_m, record.reflectivity)
+    elif return_probability is not None:
+        points_alone = points_alone * return_probability(range_m)
     bounds_m, slices = np.stack([hits.low[row], hits.high[row]], axis=1), hits.slices[row]
-    misses = None if hits.misses is None else hits.misses[row]
+    misses = hits.misses
     spans, hole_m = spans_and_holes(record, bounds_m, slices, misses)
     return VisibleTargets(
         record=record,
@@ -439,7 +454,7 @@ def visible_targets(
 
 
 def spans_and_holes(
-    record: TargetRecord, bounds_m: FloatArray, slices: NDArray[np.uint64], misses: NDArray[np.float32] | None
+    record: TargetRecord, bounds_m: FloatArray, slices: NDArray[np.uint64], misses: SliceMisses | None
 ) -> tuple[FloatArray, FloatArray]:
     """Return the shares of length and width between the outermost points, (n, 2), and the longest holes, (n,), metres.
 
@@ -452,22 +467,20 @@ def spans_and_holes(
     bounds_m, slices, misses
         As in :class:`TargetVisibility`.
     """
-    if misses is None:
-        return span_shares(record, bounds_m), longest_holes_m(record, slices)
+    spans, hole = span_shares(record, bounds_m), np.zeros(len(record))
+    vehicle_visibility.longest_slice_gaps(slices, hole)
     sizes_m = np.ascontiguousarray(record.all_boxes.values[record.row, 5:7])
-    spans, hole = np.zeros((len(record), 2)), np.zeros(len(record))
-    vehicle_visibility.expected_spans(misses, bounds_m, sizes_m, spans)
-    vehicle_visibility.expected_gaps(misses, hole)
+    if misses is not None:
+        vehicle_visibility.expected_spans(misses.misses, misses.rows, bounds_m, sizes_m, spans)
+        vehicle_visibility.expected_gaps(misses.misses, misses.rows, hole)
     return spans, hole * sizes_m[:, 0]
 
 
 def slice_misses(visible: TargetVisibility) -> NDArray[np.float32]:
-    """Return ``misses`` of :class:`TargetVisibility`, (n, 2, 64) float32; 0 or 1 without losses of returns.
+    """Return the probability that each slice has no point: of the length, and of the width, (n, 2, 64) float32.
 
-    Of a view without losses, the slices of the width with its outermost points count.
+    Of vehicles on which no loss matters, it is 0 or 1, and of the width 0 in the slices with the outermost points.
     """
-    if visible.misses is not None:
-        return visible.misses
     parts = np.arange(vehicle_visibility.SLICES)
     misses = np.ones((len(visible), 2, len(parts)), dtype=np.float32)
     misses[:, 0] = (visible.slices[:, None] >> parts.astype(np.uint64)) & np.uint64(1) == 0
@@ -476,6 +489,8 @@ def slice_misses(visible: TargetVisibility) -> NDArray[np.float32]:
     for end_m in (visible.bounds_m[rows, 0, 1], visible.bounds_m[rows, 1, 1]):
         part = np.clip(len(parts) * (end_m / width_m + 0.5), 0, len(parts) - 1).astype(np.int64)
         misses[rows, 1, part] = 0.0
+    if visible.misses is not None:
+        misses[visible.misses.rows] = visible.misses.misses
     return misses
 
 
@@ -497,22 +512,6 @@ def span_shares(record: TargetRecord, bounds_m: FloatArray) -> FloatArray:
     return shares
 
 
-def longest_holes_m(record: TargetRecord, slices: NDArray[np.uint64]) -> FloatArray:
-    """Return the longest stretch of each vehicle's length between its points without a point, (n,) float64, metres.
-
-    Parameters
-    ----------
-    record
-        The vehicles.
-    slices
-        As in :class:`TargetVisibility`, (n,) uint64.
-    """
-    share = np.zeros(len(record))
-    vehicle_visibility.longest_slice_gaps(slices, share)
-    length_m: FloatArray = record.all_boxes.values[record.row, 5]
-    return share * length_m
-
-
 class _BoxHits(NamedTuple):
     """Points on every box of a record, (b,); ``low`` and ``high`` bound them along the box's axes, (b, 2), metres."""
 
@@ -524,8 +523,8 @@ class _BoxHits(NamedTuple):
     """Which slices of the box's length have points, as bits."""
     low: FloatArray
     high: FloatArray
-    misses: NDArray[np.float32] | None
-    """Probability that slices have no point, see :class:`TargetVisibility`."""
+    misses: SliceMisses | None
+    """See :class:`TargetVisibility`."""
 
 
 class Losses(NamedTuple):
@@ -534,34 +533,43 @@ class Losses(NamedTuple):
     shares: FloatArray
     share_row: IntArray
     per_m: float
+    miss_row: IntArray
     misses: NDArray[np.float32]
 
     @classmethod
-    def of(cls, record: TargetRecord, return_probability: ByReflectivity, farthest_m: float) -> Losses:
+    def of(cls, record: TargetRecord, return_probability: ReturnProbability, farthest_m: float) -> Losses:
         """Tabulate the probability of returns up to a range, for each reflectivity of the record."""
         reflectivity, row = np.unique(record.reflectivity, return_inverse=True)
         range_m = np.arange(math.ceil(farthest_m * _STEPS_PER_M) + 2) / _STEPS_PER_M
         shares = [return_probability(range_m, np.full(len(range_m), rho)) for rho in reflectivity]
         count = len(record.all_boxes.values)
-        share_row = np.zeros(count, dtype=np.int64)
-        share_row[record.row] = row
-        misses = np.ones((count, 2, vehicle_visibility.SLICES), dtype=np.float32)
-        return cls(np.array(shares).reshape(len(shares), -1), share_row, _STEPS_PER_M, misses)
+        share_row, miss_row = np.zeros(count, dtype=np.int64), np.full(count, -1, dtype=np.int64)
+        share_row[record.row], miss_row[record.row] = row, np.arange(len(record))
+        misses = np.ones((len(record), 2, vehicle_visibility.SLICES), dtype=np.float32)
+        return cls(np.array(shares).reshape(len(shares), -1), share_row, _STEPS_PER_M, miss_row, misses)
+
+    def filled(self, record: TargetRecord, slices: NDArray[np.uint64]) -> SliceMisses:
+        """Return the probabilities that the kernel has filled; ``slices`` are those of all boxes that have points."""
+        rows = np.flatnonzero((self.miss_row[record.row] >= 0) & (slices[record.row] != 0))
+        return SliceMisses(rows, self.misses[rows])
 
 
-NO_LOSSES = Losses(
-    np.empty((0, 0)), np.empty(0, np.int64), 1.0, np.empty((0, 2, vehicle_visibility.SLICES), np.float32)
-)
+_NO_ROWS = np.empty(0, dtype=np.int64)
+_NO_MISSES = np.empty((0, 2, vehicle_visibility.SLICES), dtype=np.float32)
+NO_LOSSES = Losses(np.empty((0, 0)), _NO_ROWS, 1.0, _NO_ROWS, _NO_MISSES)
 """Every return is detected."""
 
 
 def _count_points(
-    record: TargetRecord, sensor_m: FloatArray, site: Beams, return_probability: ByReflectivity | None
+    record: TargetRecord, sensor_m: FloatArray, site: Beams, return_probability: ByRange | None
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
-    thins_spans = isinstance(return_probability, ReturnProbability) and return_probability.thins_spans
-    is_listed = return_probability is not None and not thins_spans
-    beams = sort_beams(site, 1 if is_listed or site.weight is not None else _BANDS)
+    losses = NO_LOSSES
+    if isinstance(return_probability, ReturnProbability) and return_probability.thins_spans:
+        farthest_m = math.sqrt(float((site.ends_m**2).sum(axis=1).max(initial=0.0)))
+        losses, return_probability = Losses.of(record, return_probability, farthest_m), None
+    is_counted = site.weight is None and return_probability is None
+    beams = sort_beams(site, _BANDS if is_counted else 1)
     is_target = np.zeros(count, dtype=np.bool_)
     is_target[record.row] = True
     size_m = np.asarray(record.grid.roi.size_m)
@@ -570,12 +578,9 @@ def _count_points(
     bounds = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     sums = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds
     nearest_m = beams.length_m.copy()
-    losses, capacity, reflectivity = NO_LOSSES, 0, np.zeros(count)
-    if return_probability is not None and thins_spans:
-        losses = Losses.of(record, return_probability, float(beams.length_m.max(initial=0.0)))
-    elif return_probability is not None:
+    capacity = 0
+    if return_probability is not None:
         capacity = max(MAX_HITS, len(beams.length_m))
-        reflectivity[record.row] = record.reflectivity
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
     frame = 0
@@ -583,11 +588,11 @@ def _count_points(
         frame, filled = vehicle_visibility.first_hits(
             frame, sensor_m, size_m, all_boxes, tuple(beams), nearest_m, tuple(losses), sums, hits
         )
-        if is_listed and return_probability is not None:
+        if return_probability is not None:
             box, row, hit_range_m, along_m, across_m = (column[:filled] for column in hits)
-            weight = beams.weight[row] * return_probability(hit_range_m, reflectivity[box])
+            weight = beams.weight[row] * return_probability(hit_range_m)
             vehicle_visibility.accumulate_hits(box, weight, along_m, across_m, boxes.values, sums[1:])
-    return _BoxHits(*sums, losses.misses if thins_spans else None)
+    return _BoxHits(*sums, None if losses is NO_LOSSES else losses.filled(record, sums[3]))
 
 
 class SortedBeams(NamedTuple):

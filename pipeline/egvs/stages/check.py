@@ -273,7 +273,8 @@ def run(
     Returns
     -------
     dict
-        Number of ``sites`` (those that are scanned), ``solids`` and ``lanes`` that were checked; warnings.
+        Number of ``sites`` (those that are scanned), ``solids`` and ``lanes`` that were checked; ``losses``: for which
+        sensors losses of returns are simulated; warnings.
 
     Raises
     ------
@@ -283,12 +284,12 @@ def run(
     report = check_inputs(context.inputs, scene_report(context))
     if report.errors:
         raise DiagnosticsError(report.errors, report.warnings)
-    return {
-        "sites": report.sites,
-        "solids": report.solids,
-        "lanes": report.lanes,
-        WARNINGS_KEY: [finding.to_json() for finding in report.warnings],
-    }
+    summary: Summary = {"sites": report.sites, "solids": report.solids, "lanes": report.lanes}
+    losses = context.inputs.scene.losses
+    if losses is not None and losses.notes:
+        summary["losses"] = list(losses.notes)
+    summary[WARNINGS_KEY] = [finding.to_json() for finding in report.warnings]
+    return summary
 
 
 STAGE = Stage(

@@ -92,6 +92,18 @@ def with_effects(plain: Scene) -> Scene:
     return replace(plain, effects=tuple(active), inactive_effects=tuple(inactive), losses=losses)
 
 
+def with_losses_of_all(scene: Scene) -> Scene:
+    """Return the scene with losses of all sensors, for comparisons of sensors, unless the scenario decides on losses.
+
+    The scene is returned as it is where a sensor of a site has no rated range.
+    """
+    losses = scene.losses
+    if losses is None or losses.unrated:
+        return scene
+    others = tuple(effect for effect in scene.effects if effect.NAME != registry.LOSSES)
+    return replace(scene, effects=(registry.make_losses(None), *others))
+
+
 def _losses(plain: Scene) -> LossDecision | None:
     """The decision on losses of returns; None where the scenario makes it."""
     if plain.scenario.effects.range_limit is not None:

@@ -275,6 +275,9 @@ def _summary(
             summary["zones"] = readers.describe_worst_zones(best[0], worst)
     if scoring.zones is not None and (without_results := scoring.zones.describe_for_pedestrians()):
         summary["zones_for_pedestrians"] = without_results
+    losses = context.scene.losses
+    if losses is not None and losses.acting:
+        summary["losses"] = losses.to_json()
     skipped = context.scene.skipped("score")
     if skipped:
         summary["skipped"] = skipped
