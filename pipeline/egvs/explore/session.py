@@ -480,7 +480,8 @@ class Session:
         target_scores = self._targets.scores(visible)
         if self.period:
             return {**scores, **target_scores.by_period[self.periods.index(self.period)]}
-        return scores | {name: float(values[0]) for name, values in target_scores.scores.items()}
+        of_vehicles = target_scores.scores
+        return scores | {name: float(of_vehicles[name][0]) for name in of_vehicles if name in TARGET_SCORES}
 
 
 def site_blindspots(site: str, spots: VehicleSpots, visibility: SpotVisibility, grid: Grid) -> SiteBlindspots:
