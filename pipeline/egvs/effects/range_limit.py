@@ -64,9 +64,11 @@ class RangeLimit(Detect[RangeLimitParameters]):
         """A hard limit beyond the range of all sensors changes nothing; the range of a measured scan is unknown."""
         if any(site.points is not None for site in scene.sites):
             return None
+        parameters = self.parameters
         for sensor in filter(self.acts_on, scene.used_sensors.values()):
-            model = self.return_model(sensor)
-            if model.softness > 0 or model.dropout > 0 or self.limit_m(sensor) <= sensor.range_m * (1 + 1e-9):
+            softness = sensor.softness if parameters.softness is None else parameters.softness
+            dropout = sensor.dropout if parameters.dropout is None else parameters.dropout
+            if softness > 0 or dropout > 0 or self.limit_m(sensor) <= sensor.range_m * (1 + 1e-9):
                 return None
         return "every beam ends before the limit"
 
