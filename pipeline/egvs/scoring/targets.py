@@ -540,6 +540,8 @@ class Losses(NamedTuple):
     @classmethod
     def of(cls, record: TargetRecord, return_probability: ReturnProbability, farthest_m: float) -> Losses:
         """Tabulate the probability of returns up to a range, for each reflectivity of the record."""
+        if not len(record):
+            return NO_LOSSES
         reflectivity, row = np.unique(record.reflectivity, return_inverse=True)
         range_m = np.arange(math.ceil(farthest_m * _STEPS_PER_M) + 2) / _STEPS_PER_M
         shares = [return_probability(range_m, np.full(len(range_m), rho)) for rho in reflectivity]
