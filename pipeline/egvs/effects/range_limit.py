@@ -39,9 +39,12 @@ class RangeLimit(Detect[RangeLimitParameters]):
     ----------
     sensors
         Names of the sensors with losses; None for all.
+    skips_unrated
+        Whether a sensor without a rated range has no losses, instead of raising an error.
     """
 
     sensors: frozenset[str] | None = None
+    skips_unrated: bool = False
     NAME: ClassVar[str] = "range_limit"
     SOURCE: ClassVar[str] = (
         "Höfle and Pfeifer 2007 (power law); the sensor's datasheet (threshold); fitted on two units"
@@ -58,6 +61,8 @@ class RangeLimit(Detect[RangeLimitParameters]):
 
     def acts_on(self, sensor: Sensor) -> bool:
         """Return whether the losses of a sensor are simulated."""
+        if self.skips_unrated and sensor.rated_range_m is None:
+            return False
         return self.sensors is None or sensor.name in self.sensors
 
     def why_idle(self, scene: Scene) -> str | None:

@@ -96,12 +96,11 @@ def with_effects(plain: Scene) -> Scene:
 
 
 def with_losses_of_all(scene: Scene) -> Scene:
-    """Return the scene with losses of all sensors, for comparisons of sensors, unless the scenario decides on losses.
+    """Return the scene with losses of all sensors with a rated range, for comparisons of sensors.
 
-    The scene is returned as it is where a sensor of a site has no rated range.
+    It is returned as it is where the scenario decides on losses.
     """
-    losses = scene.losses
-    if losses is None or losses.unrated:
+    if scene.losses is None:
         return scene
     others = tuple(effect for effect in scene.effects if effect.NAME != registry.LOSSES)
     return replace(scene, effects=(registry.make_losses(None), *others))

@@ -304,6 +304,7 @@ def test_designs_are_scored_with_losses(tmp_path: Path) -> None:
     path = one_lane(tmp_path)
     for rated_m, number in ((15, 0), (600, 1)):
         rated = [f"sensors.coarse.rated_range_m={rated_m}", "sensors.coarse.rated_reflectivity=0.1"]
+        rated.append("sensors.small.rated_range_m=50")  # the sensor of the sites, which named losses act on
         scores = []
         for setting in ([], ["effects.range_limit={}"], ["effects.range_limit=false"]):
             scenario = egvs.load(path, [*rated, *setting])
