@@ -736,9 +736,9 @@ def _mean_gap_of_many(miss, part, count, none):  # type: ignore[no-untyped-def]
     :func:`_chance_of_gap`.
     """
     none[:] = 1.0
-    longest = np.int64(0)
+    longest = 0
     for s in range(count - 1):
-        run, next_slice, gap = 1.0 - miss[s], s + 1, np.int64(1)  # that s has a point, and no slice after it so far
+        run, next_slice, gap = 1.0 - miss[s], s + 1, 1  # that s has a point, and no slice after it so far
         while next_slice < count - 1 or part[s] + gap < part[count - 1]:
             if part[s] + gap == part[next_slice]:
                 run *= miss[next_slice]
