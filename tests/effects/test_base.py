@@ -170,7 +170,7 @@ def test_why_idle_of_detect_effects(score_run: tuple[Path, Path]) -> None:
         assert make_effect(name, **parameters).why_idle(scene) is None
     assert make_effect("range_limit", softness=0, rated_range_m=30).why_idle(scene) is None
     with pytest.raises(InputError, match="sensor small: rated_range_m is missing"):
-        make_effect("range_limit", softness=0).why_idle(scene)
+        make_effect("range_limit", softness=0, dropout=0).why_idle(scene)
 
 
 @pytest.mark.parametrize("name", ACTIVE)

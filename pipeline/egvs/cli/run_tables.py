@@ -35,7 +35,6 @@ from egvs.report import sections
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability
 from egvs.results.levels import GROUPS_NOTE, GroupLevel, read_levels
 from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pole
-from egvs.scenario.effects_config import RangeLimitParameters
 from egvs.scenario.score_config import ALL_DETECTORS, DEFAULT_SCORE, NOTICED
 from egvs.sensors.return_model import NEGLIGIBLE_LOSS, ReturnModel
 
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
 
 _RESULT_FILE_WIDTH = 150
 _LIST_FILE_WIDTH = 160
-DARK_REFLECTIVITY = RangeLimitParameters().reflectivity
+DARK_REFLECTIVITY = 0.1
 """Reflectivity of dark vehicles, the default of the effect ``range_limit``."""
 _EXTRA_COLUMNS_WIDTH = 130
 """Terminals at least this wide show the entropy seen and the companion score next to the ranking score."""

@@ -39,9 +39,12 @@ class RangeLimit(Detect[RangeLimitParameters]):
     ----------
     sensors
         Names of the sensors with losses; None for all.
+    skips_unrated
+        Whether a sensor without a rated range has no losses, instead of raising an error.
     """
 
     sensors: frozenset[str] | None = None
+    skips_unrated: bool = False
     NAME: ClassVar[str] = "range_limit"
     SOURCE: ClassVar[str] = (
         "Höfle and Pfeifer 2007 (power law); the sensor's datasheet (threshold); fitted on two units"
@@ -58,15 +61,19 @@ class RangeLimit(Detect[RangeLimitParameters]):
 
     def acts_on(self, sensor: Sensor) -> bool:
         """Return whether the losses of a sensor are simulated."""
+        if self.skips_unrated and sensor.rated_range_m is None:
+            return False
         return self.sensors is None or sensor.name in self.sensors
 
     def why_idle(self, scene: Scene) -> str | None:
         """A hard limit beyond the range of all sensors changes nothing; the range of a measured scan is unknown."""
         if any(site.points is not None for site in scene.sites):
             return None
+        parameters = self.parameters
         for sensor in filter(self.acts_on, scene.used_sensors.values()):
-            model = self.return_model(sensor)
-            if model.softness > 0 or model.dropout > 0 or self.limit_m(sensor) <= sensor.range_m * (1 + 1e-9):
+            softness = sensor.softness if parameters.softness is None else parameters.softness
+            dropout = sensor.dropout if parameters.dropout is None else parameters.dropout
+            if softness > 0 or dropout > 0 or self.limit_m(sensor) <= sensor.range_m * (1 + 1e-9):
                 return None
         return "every beam ends before the limit"
 

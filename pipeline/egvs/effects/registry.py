@@ -83,10 +83,10 @@ def scenario_effects(scenario: Scenario, *stages: str) -> tuple[base.Effect[Any]
 
 
 def make_losses(sensors: Iterable[str] | None) -> base.Effect[Any]:
-    """Return the losses of returns of some sensors, by name, or of all for None, with the sensors' values."""
+    """Return the losses of some sensors, by name, or for None of all with a rated range, with the sensors' values."""
     effect_class = load_effect_class(LOSSES)
     names = None if sensors is None else frozenset(sensors)
-    return effect_class(effect_class.Model(), names)  # type: ignore[call-arg]
+    return effect_class(effect_class.Model(), names, True)  # type: ignore[call-arg]
 
 
 def effect_modules(effects: Iterable[base.Effect[Any]]) -> tuple[str, ...]:

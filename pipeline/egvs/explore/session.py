@@ -34,6 +34,7 @@ from egvs.clouds.simulation import CloudSimulator, VehicleMeshes, sweep_rng
 from egvs.core.errors import Diagnostic, InputError, choose_one
 from egvs.core.grid import Grid
 from egvs.effects import registry
+from egvs.effects.base import Effect
 from egvs.effects.returns import ReturnProbability
 from egvs.placement import problem_builder
 from egvs.placement.refinement import PlanPoses
@@ -243,7 +244,7 @@ class Session:
     candidates
         Scores of all candidates by name.
     engines
-        Cached scanners and scorers, by the names of the active effects.
+        Cached scanners and scorers, by the settings of the active effects.
     """
 
     def __init__(
@@ -260,7 +261,7 @@ class Session:
         self.tpog: Tpog = read_tpog(work.folder.tpog, period or None)
         self._recorded = recorded or _RecordedVehicles(work, self.tpog.grid)
         self.candidates: dict[str, PoseScore] = self._read_candidates()
-        self.engines: dict[tuple[str, ...], Engine] = {}
+        self.engines: dict[str, Engine] = {}
 
     def in_period(self, period: str) -> Session:
         """Return the same run in one period, or in all periods for an empty name."""
@@ -442,7 +443,7 @@ class Session:
         """Return scanner and scorer with the effects that act when a candidate is moved to ``site``."""
         sites = tuple(site if other.name == site.name else other for other in self.scene.sites)
         scene = scene_inputs.with_effects(replace(self.scene, sites=sites, effects=(), inactive_effects=()))
-        key = json.dumps(registry.effect_settings(scene.effects))
+        key = json.dumps(registry.effect_settings(scene.acting(Effect)))
         if key not in self.engines:
             scene = replace(scene, sites=())  # one scanner for all poses
             self.engines[key] = Engine(scene, Scanner(scene, mounts=1), self._make_scorer(scene))

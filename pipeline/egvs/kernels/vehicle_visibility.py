@@ -46,7 +46,7 @@ _STEEPEST = 1e308
 SLICES = 64
 """Slices of a vehicle's length, to find the longest stretch without points."""
 
-NEGLIGIBLE_CHANCE = 1e-4
+NEGLIGIBLE_CHANCE = 1e-3
 """Gaps that are rarer than this are not added up."""
 
 MANY_POINTS = 128.0
@@ -55,10 +55,13 @@ MANY_POINTS = 128.0
 _SHARE_UNIT = 2.0**30
 """Shares of returns are added in integer multiples of 1 / ``_SHARE_UNIT``."""
 
+MANY_SLICES = 12.0
+"""From this expected number of slices with points, the gaps after each of them are taken as independent."""
+
 SHARE_TOLERANCE = 1e-3
 """Largest difference between a share of returns and its parabola over a vehicle."""
 
-MAX_STEP_CHANGE = 2.0
+MAX_STEP_CHANGE = 1.0
 """Chances of gaps are interpolated over steps with at most this number of slices times the change of the chance."""
 
 _ON_SIDE_M = 1e-6
@@ -596,15 +599,14 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, loss, sums, hits):  # 
                 if is_smooth:
                     _weigh_box_hits(b, facing[k], directions, box_runs, nearest_m, box_t_m, parabola, loss[2], added)
                 is_certain = is_smooth and (added[0][b] >= MANY_POINTS or added[2][b] == np.uint64(0))
+                box_rows = rows[:0]
+                if not is_certain:
+                    box_rows = rows[: _list_rows(box_runs, nearest_m, box_t_m, rows)]
                 if is_certain:
                     loss[3][b] = -1
-                    box_rows = rows[:0]
-                else:
-                    box_rows = rows[: _list_rows(box_runs, nearest_m, box_t_m, rows)]
-                if is_smooth:
-                    _miss_slices(
-                        facing[k], directions, box_rows, nearest_m, parabola, loss[2], loss[4][max(loss[3][b], 0)]
-                    )
+                elif is_smooth:
+                    box_misses = loss[4][loss[3][b]]
+                    _miss_slices(facing[k], directions, box_rows, nearest_m, parabola, loss[2], box_misses)
                 elif has_losses:
                     _thin_box_hits(b, facing[k], directions, box_rows, nearest_m, weight, loss, added)
                 elif room > 0:
@@ -664,9 +666,9 @@ def expected_spans(misses, rows, bounds_m, sizes_m, spans):  # type: ignore[no-u
     Parameters
     ----------
     misses
-        Probability that a slice has no point: of the length, and of the width, (k, 2, SLICES) float32.
+        Probability that a slice has no point: of the length, and of the width, (n, 2, SLICES) float32.
     rows
-        Vehicle of each row of ``misses``, (k,) int64; the others are not filled.
+        Vehicles to fill, (k,) int64.
     bounds_m
         Lowest and highest coordinate of any point that may be detected, (n, 2, 2) float64.
     sizes_m
@@ -674,8 +676,7 @@ def expected_spans(misses, rows, bounds_m, sizes_m, spans):  # type: ignore[no-u
     spans
         Filled: shares, (n, 2) float64; 0 for a vehicle without points.
     """
-    for row in range(rows.shape[0]):
-        i = rows[row]
+    for i in rows:
         for axis in range(2):
             low, high = bounds_m[i, 0, axis], bounds_m[i, 1, axis]
             if not high > low:
@@ -683,7 +684,7 @@ def expected_spans(misses, rows, bounds_m, sizes_m, spans):  # type: ignore[no-u
                 continue
             size, empty_below, empty_above, span = sizes_m[i, axis], 1.0, 1.0, 0.0
             for part in range(SLICES):
-                below, above = misses[row, axis, part], misses[row, axis, SLICES - 1 - part]
+                below, above = misses[i, axis, part], misses[i, axis, SLICES - 1 - part]
                 if below < 1.0:  # the lowest point is in this slice
                     span -= empty_below * (1.0 - below) * max(low, size * (part / SLICES - 0.5))
                     empty_below *= below
@@ -728,18 +729,48 @@ def _chance_of_gap(miss, part, count, gap, ends):  # type: ignore[no-untyped-def
 
 
 @_kernel
+def _mean_gap_of_many(miss, part, count, none):  # type: ignore[no-untyped-def]
+    """Expected longest gap between many slices with points, where the gaps after each of them are nearly independent.
+
+    ``none``: scratch, (SLICES + 1,) float64: the probability that no gap is as long. Other parameters are as for
+    :func:`_chance_of_gap`.
+    """
+    none[:] = 1.0
+    longest = 0
+    for s in range(count - 1):
+        run, next_slice, gap = 1.0 - miss[s], s + 1, 1  # that s has a point, and no slice after it so far
+        while next_slice < count - 1 or part[s] + gap < part[count - 1]:
+            if part[s] + gap == part[next_slice]:
+                run *= miss[next_slice]
+                next_slice += 1
+            if run < NEGLIGIBLE_CHANCE:
+                break
+            none[gap] *= 1.0 - run
+            gap += 1
+        longest = max(longest, gap - 1)
+    mean = 0.0
+    for gap in range(1, longest + 1):
+        mean += 1.0 - none[gap]
+    return mean
+
+
+@_kernel
 def expected_gaps(misses, rows, share):  # type: ignore[no-untyped-def]
     """Fill the expected longest stretch between two slices with points, as a share of the length, (n,) float64.
 
     ``misses`` and ``rows`` are as for :func:`expected_spans`; other vehicles are not filled.
     """
-    miss, part, ends = np.empty(SLICES), np.empty(SLICES, np.int64), np.empty(SLICES)
-    for row in range(rows.shape[0]):
-        count = 0
+    miss, part, ends, none = np.empty(SLICES), np.empty(SLICES, np.int64), np.empty(SLICES), np.empty(SLICES + 1)
+    for i in rows:
+        count, occupied = 0, 0.0
         for s in range(SLICES):
-            if misses[row, 0, s] < 1.0:
-                miss[count], part[count] = misses[row, 0, s], s
+            if misses[i, 0, s] < 1.0:
+                miss[count], part[count] = misses[i, 0, s], s
+                occupied += 1.0 - miss[count]
                 count += 1
+        if occupied >= MANY_SLICES:
+            share[i] = _mean_gap_of_many(miss, part, count, none) / SLICES
+            continue
         total, gap, chance = 0.0, 0, 1.0  # sums the chances of gaps 1, 2, ...; longer ones are rarer
         most = part[count - 1] - part[0] - 1 if count > 1 else 0
         step = 4
@@ -751,7 +782,7 @@ def expected_gaps(misses, rows, share):  # type: ignore[no-untyped-def]
                 next_chance = _chance_of_gap(miss, part, count, gap + step, ends)
             total += 0.5 * ((step - 1) * chance + (step + 1) * next_chance)  # linear in between
             gap, chance, step = gap + step, next_chance, 2 * step
-        share[rows[row]] = total / SLICES
+        share[i] = total / SLICES
 
 
 @_kernel

@@ -326,7 +326,7 @@ class SliceMisses(NamedTuple):
     rows
         The vehicle-frames, (k,) int64. Points on any other extend as far as the beams that meet it.
     misses
-        Of the slices of the length, and of the width, (k, 2, 64) float32.
+        Of the slices of the length, and of the width, of all vehicle-frames, (n, 2, 64) float32; 1 for the others.
     """
 
     rows: IntArray
@@ -490,7 +490,8 @@ def slice_misses(visible: TargetVisibility) -> NDArray[np.float32]:
         part = np.clip(len(parts) * (end_m / width_m + 0.5), 0, len(parts) - 1).astype(np.int64)
         misses[rows, 1, part] = 0.0
     if visible.misses is not None:
-        misses[visible.misses.rows] = visible.misses.misses
+        rows = visible.misses.rows
+        misses[rows] = visible.misses.misses[rows]
     return misses
 
 
@@ -539,6 +540,8 @@ class Losses(NamedTuple):
     @classmethod
     def of(cls, record: TargetRecord, return_probability: ReturnProbability, farthest_m: float) -> Losses:
         """Tabulate the probability of returns up to a range, for each reflectivity of the record."""
+        if not len(record):
+            return NO_LOSSES
         reflectivity, row = np.unique(record.reflectivity, return_inverse=True)
         range_m = np.arange(math.ceil(farthest_m * _STEPS_PER_M) + 2) / _STEPS_PER_M
         shares = [return_probability(range_m, np.full(len(range_m), rho)) for rho in reflectivity]
@@ -551,7 +554,7 @@ class Losses(NamedTuple):
     def filled(self, record: TargetRecord, slices: NDArray[np.uint64]) -> SliceMisses:
         """Return the probabilities that the kernel has filled; ``slices`` are those of all boxes that have points."""
         rows = np.flatnonzero((self.miss_row[record.row] >= 0) & (slices[record.row] != 0))
-        return SliceMisses(rows, self.misses[rows])
+        return SliceMisses(rows, self.misses)
 
 
 _NO_ROWS = np.empty(0, dtype=np.int64)
@@ -564,12 +567,12 @@ def _count_points(
     record: TargetRecord, sensor_m: FloatArray, site: Beams, return_probability: ByRange | None
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
-    losses = NO_LOSSES
-    if isinstance(return_probability, ReturnProbability) and return_probability.thins_spans:
-        farthest_m = math.sqrt(float((site.ends_m**2).sum(axis=1).max(initial=0.0)))
-        losses, return_probability = Losses.of(record, return_probability, farthest_m), None
-    is_counted = site.weight is None and return_probability is None
+    losses, has_losses = NO_LOSSES, isinstance(return_probability, ReturnProbability) and return_probability.thins_spans
+    is_counted = site.weight is None and (return_probability is None or has_losses)
     beams = sort_beams(site, _BANDS if is_counted else 1)
+    if isinstance(return_probability, ReturnProbability) and has_losses:
+        losses = Losses.of(record, return_probability, float(beams.length_m.max(initial=0.0)))
+        return_probability = None
     is_target = np.zeros(count, dtype=np.bool_)
     is_target[record.row] = True
     size_m = np.asarray(record.grid.roi.size_m)

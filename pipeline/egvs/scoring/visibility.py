@@ -152,7 +152,8 @@ class HitCounter:
         self._transmit = tuple(effect.prepare(scene, tpog, trajectories) for effect in transmit)
         self._scene = scene
         self.unit = 1
-        if transmit or scene.acting(Detect, "score") or scene.weights_beams:
+        detect: tuple[Detect[Any], ...] = scene.acting(Detect, "score")
+        if transmit or detect or scene.weights_beams:
             self.unit = UNIT
         self._local = threading.local()
 

@@ -207,7 +207,8 @@ class ReturnModel:
         rho = self.target_reflectivity() if reflectivity is None else reflectivity
         limit_m = self.limit_m(1.0) * np.sqrt(rho)
         if self.softness == 0:
-            return (1.0 - self.dropout) * (range_m <= limit_m)
+            within: FloatArray = (1.0 - self.dropout) * (range_m <= limit_m).astype(np.float64)
+            return within
         with np.errstate(divide="ignore", over="ignore"):  # the power is infinite at the sensor itself
             detected: FloatArray = ndtr(2.0 * np.log(limit_m / range_m) / self.softness)
         return (1.0 - self.dropout) * detected
@@ -287,7 +288,9 @@ def decide_losses(sites: Iterable[Site], sensors: Mapping[str, Sensor], roi: Roi
         farthest = np.maximum(np.abs(position - low), np.abs(position - low - size))
         reach_m[site.sensor] = max(reach_m.get(site.sensor, 0.0), math.sqrt(float((farthest**2).sum())))
 
-    acting, negligible, unrated = {}, {}, []
+    acting: dict[str, tuple[float, float]] = {}
+    negligible: dict[str, tuple[float, float]] = {}
+    unrated = []
     for name, distance_m in reach_m.items():
         sensor = sensors[name]
         if sensor.rated_range_m is None:

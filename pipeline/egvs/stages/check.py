@@ -16,7 +16,7 @@ from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
 from egvs.stages import inputs as stage_inputs
-from egvs.stages import scene_checks, traffic_checks
+from egvs.stages import scene_checks, scene_inputs, traffic_checks
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.inputs import CheckInputs, Inputs
 from egvs.stages.scene_dependencies import sensor_digests
@@ -285,7 +285,7 @@ def run(
     if report.errors:
         raise DiagnosticsError(report.errors, report.warnings)
     summary: Summary = {"sites": report.sites, "solids": report.solids, "lanes": report.lanes}
-    losses = context.inputs.scene.losses
+    losses = scene_inputs.scenario_losses(context.scenario, context.inputs.candidates)
     if losses is not None and losses.notes:
         summary["losses"] = list(losses.notes)
     summary[WARNINGS_KEY] = [finding.to_json() for finding in report.warnings]

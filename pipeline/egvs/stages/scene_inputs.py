@@ -6,6 +6,7 @@ and score stages that can change a result.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +17,7 @@ from egvs.scenario.model import Scenario
 from egvs.sensors import site_feasibility, sites
 from egvs.sensors.return_model import LossDecision, decide_losses
 from egvs.sensors.scene import InactiveEffect, Scene
+from egvs.sensors.sensor import scenario_sensor
 from egvs.sensors.site_feasibility import SiteSelection
 from egvs.sensors.sites import Site
 from egvs.traffic import sumo_folder
@@ -80,7 +82,8 @@ def with_effects(plain: Scene) -> Scene:
     """Add the effects on beams and clouds that can change a result: those of the scenario, and losses of returns."""
     active: list[Effect[Any]] = []
     inactive = []
-    losses = _losses(plain)
+    candidates = (*plain.sites, *(site for site, _ in plain.dropped))
+    losses = scenario_losses(plain.scenario, candidates)
     if losses is not None and losses.acting:
         active.append(registry.make_losses(losses.acting))
     for effect in registry.scenario_effects(plain.scenario, "scan", "score", "clouds"):
@@ -93,19 +96,19 @@ def with_effects(plain: Scene) -> Scene:
 
 
 def with_losses_of_all(scene: Scene) -> Scene:
-    """Return the scene with losses of all sensors, for comparisons of sensors, unless the scenario decides on losses.
+    """Return the scene with losses of all sensors with a rated range, for comparisons of sensors.
 
-    The scene is returned as it is where a sensor of a site has no rated range.
+    It is returned as it is where the scenario decides on losses.
     """
-    losses = scene.losses
-    if losses is None or losses.unrated:
+    if scene.losses is None:
         return scene
     others = tuple(effect for effect in scene.effects if effect.NAME != registry.LOSSES)
     return replace(scene, effects=(registry.make_losses(None), *others))
 
 
-def _losses(plain: Scene) -> LossDecision | None:
-    """The decision on losses of returns; None where the scenario makes it."""
-    if plain.scenario.effects.range_limit is not None:
+def scenario_losses(scenario: Scenario, candidates: Sequence[Site]) -> LossDecision | None:
+    """Return which sensors of all candidate sites need losses of returns; None where the scenario decides."""
+    if scenario.effects.range_limit is not None:
         return None
-    return decide_losses(plain.sites, plain.used_sensors, plain.roi)
+    sensors = {site.sensor: scenario_sensor(site.sensor, scenario, f"site {site.name}") for site in candidates}
+    return decide_losses(candidates, sensors, scenario.roi.box)

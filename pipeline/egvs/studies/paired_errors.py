@@ -205,21 +205,19 @@ def interval_changes(folder: Path, sites: Mapping[str, RankedSite]) -> dict[str,
         Change of the score that ranks, by site; 0 without losses. None where scores cannot be computed again, or the
         scenario sets a reflectivity.
     """
-    record = RunRecord.read(folder)
-    config = EffectsConfig.from_dict(record.scenario.get("effects", {})).range_limit
     changes = dict.fromkeys(sites, 0.0)
-    if config is False:
-        return changes
-    sensors = {site.sensor for site in sites.values()}
-    if config is None:
-        sensors = set(record.stages["score"].summary.get("losses", {}).get("on", ()))
-    elif config.reflectivity is not None:
-        return None
-    affected = {name: site for name, site in sites.items() if site.sensor in sensors}
-    if not affected:
-        return changes
     low, high = REFLECTIVITY_INTERVAL
     try:
+        record = RunRecord.read(folder)
+        config = EffectsConfig.from_dict(record.scenario.get("effects", {})).range_limit
+        if config and config.reflectivity is not None:
+            return None
+        sensors = {site.sensor for site in sites.values()}
+        if not config:
+            sensors = set(record.stages["score"].summary.get("losses", {}).get("on", ()))
+        affected = {name: site for name, site in sites.items() if site.sensor in sensors}
+        if not affected:
+            return changes
         column, names = _score_again(folder, affected, reflectivity=high)
         lowest, _ = _score_again(folder, affected, reflectivity=low)
     except InputError:
