@@ -170,8 +170,8 @@ MOST_LINES = {
     "scan": 11_300,
     "traffic": 9_800,
     "tpog": 4_000,
-    "score": 16_200,  # losses of returns are part of every score
-    "report": 19_300,
+    "score": 16_500,  # losses of returns are part of every score; what people notice, and levels of groups
+    "report": 19_700,
 }
 """Code lines behind the key of each stage, at most: a stage runs again whenever one of them changes."""
 
