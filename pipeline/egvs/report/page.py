@@ -92,7 +92,7 @@ _UNMODELLED = (
     ("occlusion between vehicles (in the EGVS)", "moving_occlusion"),
     ("rain", "rain"),
     ("fog", "fog"),
-    ("losses of returns by distance", "range_limit"),
+    ("attenuation of beams with distance", "range_limit"),
     ("partly transparent foliage", "foliage"),
     ("pedestrians and cyclists", "pedestrians_bicycles"),
     ("dirt and glare", ""),
