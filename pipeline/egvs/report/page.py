@@ -350,7 +350,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
     scenario = contents.scenario
     effects, gamma = list(scenario.effects.named), scenario.gamma
     modelled = set(effects)
-    if contents.stages["score"].summary.get("losses"):
+    if "score" in contents.stages and contents.stages["score"].summary.get("losses"):
         modelled.add("range_limit")
     frames = contents.tpog.frames
     if contents.by_period is not None:
