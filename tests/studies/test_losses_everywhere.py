@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -95,19 +96,19 @@ def test_what_if(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_explorer(mini: Path, tmp_path: Path, by_itself: list[float]) -> None:
     pytest.importorskip("viser", reason="the extra egvs[explore] is not installed")
-    from egvs.explore.settings import Settings, open_session
+    from egvs.explore.settings import Settings, offered_effects, open_session
 
     session = open_session(mini, RATED, tmp_path / "session")
     for share, (name, candidate) in zip(by_itself, session.candidates.items(), strict=True):
         assert candidate.scores["expected_detections"] == share
         assert session.rate(name, candidate.site.pose).scores == candidate.scores
-    settings = Settings.from_scenario(session.scenario)
-    assert "range_limit" in settings.effects
-    without = Settings(settings.gamma, settings.rank_by, settings.effects - {"range_limit"})
-    assert without.overrides(session.scenario) == (OFF,)
-    changed = without.apply(session.scenario)
-    assert changed.effects.range_limit is False
-    assert settings.apply(changed).effects.range_limit is not False
+    assert "range_limit" not in offered_effects(session), "it acts by itself"
+    named = egvs.load(mini, (*RATED, NAMED))
+    without = replace(Settings.from_scenario(named), effects=frozenset())
+    assert without.overrides(named) == (OFF,)
+    assert without.apply(named).effects.range_limit is False
+    other = replace(Settings.from_scenario(egvs.load(mini, (OFF,))), gamma=3.0)
+    assert other.apply(egvs.load(mini, (OFF,))).effects.range_limit is False
 
 
 def test_explorer_gives_losses_to_a_sensor_that_moves_away(tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ _UNMODELLED = (
     ("occlusion between vehicles (in the EGVS)", "moving_occlusion"),
     ("rain", "rain"),
     ("fog", "fog"),
-    ("losses of returns by distance", "range_limit"),
+    ("attenuation of beams with distance", "range_limit"),
     ("partly transparent foliage", "foliage"),
     ("pedestrians and cyclists", "pedestrians_bicycles"),
     ("dirt and glare", ""),
@@ -368,7 +368,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
     scenario = contents.scenario
     effects, gamma = list(scenario.effects.named), scenario.gamma
     modelled = set(effects)
-    if contents.stages["score"].summary.get("losses"):
+    if "score" in contents.stages and contents.stages["score"].summary.get("losses"):
         modelled.add("range_limit")
     frames = contents.tpog.frames
     if contents.by_period is not None:
