@@ -16,8 +16,8 @@ A curve is made from its row of the table as follows.
    node.
 
 So the share of n points is :math:`\sum_j h_j(n) s_j` with hat functions :math:`h_j` of the nodes. The mean over
-vehicle-frames is :math:`\sum_k m_k s_k`, where :math:`m_k` is the mean of all hat functions of pool k. Pools are
-independent, so the curves contribute
+vehicle-frames is :math:`\sum_k m_k s_k`, where :math:`m_k` is the mean of all hat functions of pool k. Pools are taken
+as independent, also those of different groups, although they come from the same sweeps. So the curves contribute
 
 .. math:: se^2 = \sum_k (m_k \, se_k)^2
 
