@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import egvs
+from egvs.artefacts import readers
 from egvs.artefacts.parquet import read_artefact
 from egvs.core.errors import InputError
 from egvs.scenario.score_config import ScoreConfig, VehicleClass
@@ -212,7 +213,7 @@ def test_columns_are_sums_over_vehicles(mini: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_groups_have_a_level_each(mini: Path, tmp_path: Path) -> None:
+def test_groups_have_a_level_each(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     """With one of the two vehicles as a bus of the same size: levels of the groups average to that of all."""
     fcd, toml = mini / "fcd.csv", mini / "scenario.toml"
     lines = fcd.read_text(encoding="utf-8").splitlines()
@@ -221,7 +222,8 @@ def test_groups_have_a_level_each(mini: Path, tmp_path: Path) -> None:
     text = toml.read_text(encoding="utf-8")
     bus = '[[traffic.kinds]]\nname = "bus"\nvclass = "bus"\nlength_m = 4.5\nwidth_m = 1.8\nheight_m = 1.5\n\n'
     toml.write_text(text.replace("[[traffic.kinds]]", f"{bus}[[traffic.kinds]]", 1), encoding="utf-8")
-    egvs.run(egvs.load(mini, ["score.rank_by=expected_detections"]), tmp_path, jobs=1)
+    code, printed, _ = run_egvs("run", mini, "--out", tmp_path, "--all", "--set", "score.rank_by=expected_detections")
+    assert code == 0
     levels = read_artefact(tmp_path / "levels.parquet", "levels")[0].to_pylist()
     for of_all, *groups in zip(*(levels[start::3] for start in range(3)), strict=True):
         assert [group["road_users"] for group in groups] == ["cars", "larger vehicles"]
@@ -230,3 +232,15 @@ def test_groups_have_a_level_each(mini: Path, tmp_path: Path) -> None:
         for name in ("expected_detections", "noticed"):
             mean = sum(n * group[name] for n, group in zip(counts, groups, strict=True)) / sum(counts)
             assert of_all[name] == pytest.approx(mean, rel=1e-9)
+
+    best = readers.read_scores(tmp_path / "scores.parquet").to_pylist()
+    first = next(row["site"] for row in best if row["rank"] == 1)
+    larger = next(row for row in levels if row["site"] == first and row["road_users"] == "larger vehicles")
+    (line,) = (line for line in printed.splitlines() if line.startswith("larger vehicles"))
+    noticed_percent, error = f"{100.0 * larger['noticed']:.0f}", f"{100.0 * larger['noticed_se']:.0f}"
+    assert line.split()[2] == str(larger["observations"]) and line.endswith(f"{noticed_percent} ± {error} %")
+    assert "they say nothing about vans, trucks and buses" in " ".join(printed.split())
+    page = (tmp_path / "report.html").read_text(encoding="utf-8").replace("\u00a0", " ")
+    assert "TUM Traffic Intersection Dataset, Zimmer et al. 2023" in page
+    assert f'<th scope="row">larger vehicles</th><td class="n">{larger["observations"]}</td>' in page
+    assert f"{noticed_percent} ± {error} %</td>" in page

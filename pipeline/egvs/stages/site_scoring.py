@@ -238,7 +238,7 @@ class TargetScorer:
         scores: dict[str, FloatArray] = {}
         for name, vehicle_values in values.items():
             scores[name] = self._replicates(name, vehicle_values, parts)
-        scores |= self._level_scores(visible, values, parts)
+        scores |= self._level_scores(visible, scores, values, parts)
 
         by_period = []
         for _, rows in self._periods:
@@ -252,18 +252,26 @@ class TargetScorer:
         return SiteTargetScores(scores, tuple(by_period), missed)
 
     def _level_scores(
-        self, visible: VisibleTargets, values: Mapping[str, FloatArray], parts: Mapping[str, FloatArray]
+        self,
+        visible: VisibleTargets,
+        of_run: Mapping[str, FloatArray],
+        values: Mapping[str, FloatArray],
+        parts: Mapping[str, FloatArray],
     ) -> dict[str, FloatArray]:
-        """Return what detectors find and people notice of each group of road users, with bounds of the latter."""
+        """Return what detectors find and people notice of each group of road users, with bounds of the latter.
+
+        ``of_run`` are the scores of all road users; other parameters are those of :meth:`_replicates`, by score.
+        """
         scores: dict[str, FloatArray] = {}
         bounds = dict(zip(NOTICED_BOUNDS, noticed_bounds(visible), strict=True))
         for group, members in self.levels.items():
             for name, bound in bounds.items():
                 scores[group_score(name, group)] = np.array([weighted_mean(bound, self.weight * members)])
-            if group == ALL_USERS:  # the scores of the run
+            if group == ALL_USERS:
                 continue
             for score in (DEFAULT_SCORE, NOTICED):
-                scores[group_score(score, group)] = self._replicates(score, values[score], parts, members)
+                of_group = of_run[score] if members.all() else self._replicates(score, values[score], parts, members)
+                scores[group_score(score, group)] = of_group
         return scores
 
     def _replicates(
@@ -295,7 +303,8 @@ class TargetScorer:
         means = self._groups.means(values, configured)
         if not self.score_groups.get(name):
             return means
-        of_parts = np.array([weighted_mean(part, weight) for part in parts[name]])
+        # most curves have no road user: sums of zeros cost as much as others
+        of_parts = np.array([weighted_mean(part, weight) if part.any() else 0.0 for part in parts[name]])
         if name == DEFAULT_SCORE:
             return np.append(means, means_without_each(of_parts))
         return np.append(means, means[0] + of_parts)
