@@ -70,9 +70,7 @@ def test_signal_plans_are_no_assumption_once_they_are_given(mini: Path) -> None:
     assert sections.describe_caveats(some, "ranking", plans=[given]) == sentence
 
 
-def test_says_that_losses_of_several_sensors_are_off_where_they_are(
-    mini: Path, tmp_path: Path, run_egvs
-) -> None:
+def test_says_that_losses_of_several_sensors_are_off_where_they_are(mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\na,10,12,5,VLP-16\nb,30.5,-12,5,VLP-32C\n")
     scenario = mini / "scenario.toml"
     scenario.write_text(scenario.read_text().replace('sensor = "small"\n', "", 1))
