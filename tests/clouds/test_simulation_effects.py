@@ -200,7 +200,7 @@ def test_vehicle_draws_are_even_and_fixed_by_name_and_seed():
 
 
 def test_points_on_vehicles_are_those_that_scores_expect(mini):
-    """Windows return less and the rest of a body more than the formula of scores; the sum over a vehicle is the same."""
+    """Windows return less and the rest of a body more than the formula of scores; the sum is the same."""
     rated = ("effects.range_limit={rated_range_m=40, rated_reflectivity=0.1}",)
     scene, sensor = build_scene(mini, *rated), make_sensor(**{**FINE, "azimuth_step_deg": 0.25})
     simulator = CloudSimulator(scene, POSE, sensor, "here")
