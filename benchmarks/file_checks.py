@@ -74,9 +74,9 @@ def measure_checks() -> Iterator[dict[str, float]]:
 
     one_s, started = launcher_s(), sumo._start_program
 
-    def counted(command: Sequence[str], *more: Any, **named: Any) -> Any:
+    def counted(command: Sequence[str], *more: Any) -> Any:
         spent_s[START] += one_s
-        return started(command, *more, **named)
+        return started(command, *more)
 
     with ExitStack() as patches:
         for name, (module, check) in CHECKS.items():

@@ -19,9 +19,11 @@ def test_checks_work_while_they_are_timed(tmp_path: Path, monkeypatch: pytest.Mo
         with pytest.raises(InputError, match="read another file"):
             user_files.copy_checked(tmp_path / "a.xml", tmp_path / "b.xml")
         for _ in range(3):
-            with sumo._start_program(["/bin/sh", "-c", "exit 0"], tmp_path, None, None) as process:
+            with sumo._start_program(
+                ["/bin/sh", "-c", "exit 0"], tmp_path, sumo.Allowance.for_input(tmp_path), None, None
+            ) as process:
                 assert "sandbox.py" in str(process.args)
     assert spent_s[file_checks.START] == 6.0
     assert spent_s["files read before they are copied"] > 0.0
-    with sumo._start_program(["/bin/sh", "-c", "exit 0"], tmp_path, None, None):
+    with sumo._start_program(["/bin/sh", "-c", "exit 0"], tmp_path, sumo.Allowance.for_input(tmp_path), None, None):
         assert spent_s[file_checks.START] == 6.0
