@@ -165,13 +165,13 @@ def test_library_versions_are_those_installed() -> None:
 
 
 MOST_LINES = {
-    "check": 16_600,
-    "statics": 9_800,
-    "scan": 12_300,
-    "traffic": 10_500,
-    "tpog": 4_100,
-    "score": 16_800,
-    "report": 19_800,
+    "check": 17_200,
+    "statics": 9_900,
+    "scan": 12_900,
+    "traffic": 10_600,
+    "tpog": 4_200,
+    "score": 17_900,
+    "report": 20_900,
 }
 """Code lines behind the key of each stage, at most: a stage runs again whenever one of them changes."""
 
