@@ -95,9 +95,14 @@ class PartPlan:
         return f"{self.junction.name} {self.part}"
 
     def load_scenario(self) -> Scenario:
-        """Load the scenario of the junction, with its own sites."""
-        frames = FEWER_FRAMES.get(self.junction.name)
-        return load(self.scenario_folder, () if frames is None else (f"traffic.frames={frames}",))
+        """Load the scenario of the junction, with its own sites.
+
+        Without losses of returns: the study was frozen before they belonged to the sensor.
+        """
+        overrides = ["effects.range_limit=false"]
+        if self.junction.name in FEWER_FRAMES:
+            overrides.append(f"traffic.frames={FEWER_FRAMES[self.junction.name]}")
+        return load(self.scenario_folder, overrides)
 
     @property
     def is_trial(self) -> bool:
