@@ -85,7 +85,7 @@ def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
     figures = []
     for word, named in (("before", {}), ("after", {name: combined})):
         scenario, out = (
-            base.with_effects(EffectsConfig.from_dict(named)),
+            base.with_effects(EffectsConfig.from_dict({"range_limit": False, **named})),
             folder / scenario_name / (word if named else "plain") / (name if named else ""),
         )
         run.run(scenario, out)

@@ -136,8 +136,9 @@ def table_row(
 
 def compare(scenario: Scenario, out: Path, frames: int, variants: list[str]) -> None:
     """Print a row of the table for each variant."""
+    named = {"range_limit": False, **scenario.effects.named}  # losses would act by themselves
+    scenario = scenario.with_effects(scenario.effects.model_validate(named))
     score = planned_scores(scenario, out)
-    named = scenario.effects.named
     plain = SiteDetections.measure(scenario, out, frames).ap_by_site()
     for name in variants:
         changed = scenario.with_effects(scenario.effects.model_validate({**named, **VARIANTS[name]}))

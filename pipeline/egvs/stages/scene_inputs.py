@@ -17,7 +17,7 @@ from egvs.scenario.model import Scenario
 from egvs.sensors import site_feasibility, sites
 from egvs.sensors.return_model import LossDecision, decide_losses
 from egvs.sensors.scene import InactiveEffect, Scene
-from egvs.sensors.sensor import scenario_sensor
+from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.site_feasibility import SiteSelection
 from egvs.sensors.sites import Site
 from egvs.traffic import sumo_folder
@@ -110,5 +110,13 @@ def scenario_losses(scenario: Scenario, candidates: Sequence[Site]) -> LossDecis
     """Return which sensors of all candidate sites need losses of returns; None where the scenario decides."""
     if scenario.effects.range_limit is not None:
         return None
-    sensors = {site.sensor: scenario_sensor(site.sensor, scenario, f"site {site.name}") for site in candidates}
-    return decide_losses(candidates, sensors, scenario.roi.box)
+    sensors: dict[str, Sensor] = {}
+    known = []
+    for site in candidates:
+        try:
+            if site.sensor not in sensors:
+                sensors[site.sensor] = scenario_sensor(site.sensor, scenario, f"site {site.name}")
+        except InputError:
+            continue  # an unknown sensor or a wrong beam table, which the check and the scan of this site report
+        known.append(site)
+    return decide_losses(known, sensors, scenario.roi.box)
