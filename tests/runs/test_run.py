@@ -27,7 +27,15 @@ from tests import processes
 from tests.conftest import fcd, write_mini
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = ("statics.ply", "scans.parquet", "trajectories.parquet", "tpog.parquet", "scores.parquet", "blindspots.parquet")
+DATA = (
+    "statics.ply",
+    "scans.parquet",
+    "trajectories.parquet",
+    "tpog.parquet",
+    "scores.parquet",
+    "levels.parquet",
+    "blindspots.parquet",
+)
 
 
 def digests(out: Path) -> dict[str, str]:
