@@ -46,6 +46,8 @@ class Case:
         Right scores, if they are not those of the truth.
     extension
         Name of the extension that reads the files.
+    starts_processes
+        Whether another program has to run.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Case:
     tolerance: float = 1e-9
     scores: Callable[[], dict[str, float]] | None = None
     extension: str = ""
+    starts_processes: bool = False
 
 
 def key(name: str, value: Any) -> Plant:

@@ -8,7 +8,7 @@ from types import ModuleType
 import pyarrow.parquet as pq
 
 import egvs
-from egvs.core.errors import WARNINGS_KEY, Diagnostic, DiagnosticsError, InputError
+from egvs.core.errors import WARNINGS_KEY, Diagnostic, DiagnosticsError, InputError, RunError
 from egvs.stages import check, scan, score, statics, tpog, traffic
 from tests.stage_runner import run_stage
 
@@ -29,5 +29,7 @@ def outcome(folder: Path) -> tuple[dict[str, float], list[Diagnostic]]:
         return {}, [*error.findings, *error.warnings]
     except InputError as error:
         return {}, [Diagnostic.of("input", error)]
+    except RunError as error:
+        return {}, [Diagnostic("run", str(error), str(error), "", is_error=True)]
     rows = pq.read_table(folder / "out" / "scores.parquet", columns=["site", "egvs"]).to_pylist()
     return {row["site"]: row["egvs"] for row in rows}, findings

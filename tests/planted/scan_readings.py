@@ -61,7 +61,7 @@ def measured_scores() -> dict[str, float]:
 def scan_case(name: str, change: Callable[[FloatArray, Mount], FloatArray], words: str, of: str = "pole_a") -> Case:
     """A case of a measured scan."""
     plant = file("scan.csv", scan(change, of))
-    return Case(name, measured, plant, "site pole_a: points: scan.csv", words, scores=measured_scores)
+    return Case(name, measured, plant, "scan.csv", words, scores=measured_scores)
 
 
 SCANS = (

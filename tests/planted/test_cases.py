@@ -16,7 +16,14 @@ from tests.planted.outcome import outcome
 TINY_TRAFFIC = ("traffic autocorrelation",)
 """Rules of warnings that all these scenarios get, since 20 seconds of traffic are few."""
 
-EACH = [pytest.param(case, id=case.name, marks=[needs(case.extension)] if case.extension else []) for case in CASES]
+
+def marks(case: Case) -> list[pytest.MarkDecorator]:
+    """What a case needs."""
+    extensions = [needs(case.extension)] if case.extension else []
+    return [*extensions, pytest.mark.system] if case.starts_processes else extensions
+
+
+EACH = [pytest.param(case, id=case.name, marks=marks(case)) for case in CASES]
 
 
 def is_about_tiny_traffic(finding: Diagnostic) -> bool:

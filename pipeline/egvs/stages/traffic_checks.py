@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from egvs.artefacts import tpog
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Roi
-from egvs.core.wording import list_first
 from egvs.effects import registry
 from egvs.formats import xml
 from egvs.scenario.model import Scenario
 from egvs.stages import height_checks
 from egvs.stages.inputs import CheckInputs, ErrorCollector
 from egvs.traffic import (
+    class_sizes,
     demand,
     fcd,
     finished_fcd,
@@ -33,17 +33,8 @@ from egvs.traffic import (
 )
 from egvs.traffic.network import ROAD_VCLASSES
 from egvs.traffic.traffic_sources import RecordedTraffic
-from egvs.traffic.vehicle_boxes import VehicleSize
 from egvs.world import clearances, geolocation
 
-SIZE_LIMITS_M = ((2.0, 80.0), (1.0, 4.0), (0.8, 6.0))
-"""Smallest and largest length, width and height of motor vehicles: from microcars to double trams and heavy loads."""
-
-SMALL_SIZE_LIMITS_M = ((0.8, 4.0), (0.3, 2.0), (0.5, 3.0))
-"""Those of motorcycles and mopeds, with three wheels, too."""
-
-_SMALL_VCLASSES = ("motorcycle", "moped")
-_MAX_LISTED_SIZES = 3
 _UNUSUAL_SHARE = 0.25
 """A recording has some wrong sizes; if so many of its types have one, the units are wrong."""
 
@@ -320,8 +311,7 @@ def _recorded_findings(scenario: Scenario, recorded: RecordedTraffic) -> list[Di
     if scenario.traffic.tracks is None:
         return list(recorded.shared_names.findings(where))
     motor_types = frozenset(name for name, size in recorded.sizes.items() if size.vclass in ROAD_VCLASSES)
-    unusual = _describe_unusual_sizes(recorded.sizes)
-    findings = [_size_warning(where, unusual)] if len(unusual) > _UNUSUAL_SHARE * len(motor_types) else []
+    findings = list(class_sizes.warn_unusual_sizes(recorded.sizes, where, _UNUSUAL_SHARE))
     roads = sumo_folder.read_network(scenario)
     compared = road_check.check_tables(
         recorded.rows, roads, scenario.roi.box, motor_types - recorded.uncounted_types, recorded.shared_names
@@ -369,30 +359,7 @@ def warn_vehicle_sizes(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Warn about kinds of vehicles with a size that no vehicle has: centimetres, feet, length and width swapped."""
     traffic = inputs.scenario.traffic
     key = f"{sumo_folder.traffic_location(inputs.scenario)}.kinds"
-    unusual = _describe_unusual_sizes(finished_fcd.sizes_of_kinds(traffic.named_kinds))
-    if unusual:
-        yield _size_warning(key, unusual)
-
-
-def _size_warning(where: str, unusual: Sequence[str]) -> Diagnostic:
-    problem = f"expected usual sizes of vehicles, got {list_first(unusual, _MAX_LISTED_SIZES)}"
-    hint = "Check the units, and that lengths and widths are not swapped."
-    return Diagnostic("vehicle sizes", where, problem, hint)
-
-
-def _describe_unusual_sizes(sizes: Mapping[str, VehicleSize]) -> list[str]:
-    """Return a text for each type of motor vehicle whose size is outside of the usual limits."""
-    unusual = []
-    for name, size in sizes.items():
-        if size.vclass not in ROAD_VCLASSES:
-            continue
-        limits_m = SMALL_SIZE_LIMITS_M if size.vclass in _SMALL_VCLASSES else SIZE_LIMITS_M
-        size_m = (size.length_m, size.width_m, size.height_m)
-        if not all(low <= value <= high for value, (low, high) in zip(size_m, limits_m, strict=True)):
-            limits = ", ".join(f"{low:g} to {high:g}" for low, high in limits_m)
-            lengths = " x ".join(f"{value:g}" for value in size_m)
-            unusual.append(f"{name} ({size.vclass}): {lengths} m (usual: {limits} m)")
-    return unusual
+    yield from class_sizes.warn_unusual_sizes(finished_fcd.sizes_of_kinds(traffic.named_kinds), key)
 
 
 @_for_each_period
