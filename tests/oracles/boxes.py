@@ -14,10 +14,12 @@ rational) or mpmath floats of 50 digits; nothing here knows which."""
 from __future__ import annotations
 
 import itertools
+import math
 from fractions import Fraction
 from typing import Any
 
 import mpmath
+import numpy as np
 
 DIGITS = 50
 SHRINK_M = Fraction(1, 10**4)
@@ -136,3 +138,20 @@ def tpog(frames: Any, values: Any, shape: Any, voxel_m: float, total: int) -> tu
         for i, j, k in here:
             counts[i][j][k] += 1
     return counts, ambiguous
+
+
+def occupied_by_upright(
+    centre_m: Any, yaw_rad: float, size_m: tuple[float, float, float], shape: Any, voxel_m: float
+) -> Any:
+    """Voxels of a grid (bool, of its shape) that an upright box occupies, in float64: separating axes in plan."""
+    half = np.array(size_m) / 2.0 - float(SHRINK_M)
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    to_x, to_y, z = ((np.arange(n) + 0.5) * voxel_m - c for n, c in zip(shape, centre_m, strict=True))
+    dx, dy = np.meshgrid(to_x, to_y, indexing="ij")
+    r = voxel_m / 2.0
+    span = r * (abs(cos) + abs(sin))
+    in_plan = np.abs(dx) < r + half[0] * abs(cos) + half[1] * abs(sin)
+    in_plan &= np.abs(dy) < r + half[0] * abs(sin) + half[1] * abs(cos)
+    in_plan &= np.abs(dx * cos + dy * sin) < half[0] + span
+    in_plan &= np.abs(dy * cos - dx * sin) < half[1] + span
+    return in_plan[:, :, None] & (np.abs(z) < r + half[2])

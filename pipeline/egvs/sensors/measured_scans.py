@@ -1,16 +1,18 @@
 """Compare measured scans with the static world at the stated poses.
 
-A measured scan is wrong where its points are in another frame than the scenario says: in the sensor's, mirrored, or of
-another site. Each of these is a *reading* of the file: positions of the points relative to a sensor. For each reading,
-the world is cast along the directions of the points. A point *agrees* if it is on the surface that its beam meets, to
-:data:`ON_SURFACE_M` and :data:`ON_SURFACE_SHARE` of its range, at right angles to that surface: a small error of the
-pose moves ground far along the beam, but hardly away from the ground. Where effects let beams through a surface, such
-as the crown of a tree, points on it agree, and points behind it.
+A measured scan is wrong where its points are in another frame than the scenario says: in the sensor's, mirrored, in
+feet, or of another site. Each of these is a *reading* of the file: positions of the points relative to a sensor. For
+each reading, the world is cast along the directions of the points.
+
+A point *agrees* if it is on the surface that its beam meets, to :data:`ON_SURFACE_M` and :data:`ON_SURFACE_SHARE` of
+its range, at right angles to that surface: a small error of the pose moves ground far along the beam, but hardly away
+from the ground. Where effects let beams through a surface, such as the crown of a tree, points on it agree, and points
+behind it.
 
 Ground looks the same in many readings, so a reading fits clearly better if many more points agree
 (:data:`MIN_LARGE_GAIN`), or some more (:data:`MIN_GAIN`) and many of those that are not on the ground
-(:data:`MIN_STRUCTURE_GAIN`). Traffic, and what the map
-leaves out, agree in no reading. Nothing is searched: the stated pose is right, or one of the readings is.
+(:data:`MIN_STRUCTURE_GAIN`). Traffic, and what the map leaves out, agree in no reading. Nothing is searched: the stated
+pose is right, or one of the readings is.
 """
 
 from __future__ import annotations
@@ -52,6 +54,7 @@ MAX_OTHER_SITES = 20
 _MAX_POINTS = 2000
 _MAX_COMPARED = 2_000_000
 _MIN_RANGE_M = 0.1
+_FOOT_M = 0.3048
 
 _MIRRORED = {
     "with y mirrored": np.diag([1.0, -1.0, 1.0]),
@@ -196,6 +199,7 @@ def _readings(site: Site, points_m: FloatArray, sites: Sequence[Site]) -> Iterat
     yield Reading("", site.pose, points_m - position_m)
     yield Reading("in the sensor's frame", site.pose, points_m @ rotation.T)
     yield Reading("relative to the sensor, along the axes of the world", site.pose, points_m)
+    yield Reading("in feet", site.pose, points_m * _FOOT_M - position_m)
     for name, mirror in _MIRRORED.items():
         yield Reading(f"in the world frame {name}", site.pose, points_m @ mirror - position_m)
         yield Reading(f"{name} about the sensor", site.pose, (points_m - position_m) @ mirror)

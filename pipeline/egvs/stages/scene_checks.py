@@ -9,8 +9,9 @@ areas of the lanes in plan.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from functools import lru_cache, partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -199,6 +200,21 @@ def check_poses(inputs: CheckInputs) -> Iterator[Diagnostic]:
         yield Diagnostic("beams beside the region", "sites", problem, "Change yaw, pitch, position or sensor.")
 
 
+def warn_equal_sites(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about sites with the pose and the sensor of another one: a plan would count one sensor twice."""
+    first_names: dict[Hashable, str] = {}
+    equal = []
+    for site in inputs.sites:
+        first = first_names.setdefault((site.pose, site.sensor, site.points), site.name)
+        if first != site.name:
+            equal.append(f"{site.name} = {first}")
+    if equal:
+        verb = by_number(len(equal), "has", "have")
+        problem = f"{number_of(len(equal), 'site')} {verb} the pose and the sensor of another one:"
+        hint = "List each candidate once."
+        yield Diagnostic("equal sites", "sites", f"{problem} {list_first(equal, MAX_LISTED_SITES)}", hint)
+
+
 def warn_sites_on_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Warn about each named site in a lane or within a junction, unless it is above the traffic."""
     config = inputs.scenario.sites
@@ -325,6 +341,26 @@ def warn_solids_over_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
     problem = f"{count} {format_percent(share)} of the lanes in and around the region: {named}"
     hint = "Move or lift them, or check their coordinates: traffic would drive through them."
     yield Diagnostic("solids over lanes", "statics", problem, hint)
+
+
+def warn_repeated_solids(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about solids that are listed twice; a crown that is dims beams twice."""
+    world = inputs.world
+    if world is None:
+        return
+    first_solids: dict[bytes, int] = {}
+    repeated = []
+    order = np.argsort(world.solid_of_face, kind="stable")
+    corners_m = world.triangles_m[order]
+    ends = np.searchsorted(world.solid_of_face[order], np.arange(len(world.solids) + 1))
+    for solid, (first, end) in enumerate(pairwise(ends)):
+        if end > first and first_solids.setdefault(corners_m[first:end].tobytes(), solid) != solid:
+            repeated.append(world.solids[solid][0])
+    if repeated:
+        names = list_first(repeated, MAX_NAMED_SOLIDS)
+        verb = by_number(len(repeated), "has", "have")
+        problem = f"{number_of(len(repeated), 'solid')} {verb} the shape and the position of another one: {names}"
+        yield Diagnostic("repeated solids", "statics", problem, "List each solid, and each file, once.")
 
 
 def warn_solids_far_away(inputs: CheckInputs) -> Iterator[Diagnostic]:

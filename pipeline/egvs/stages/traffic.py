@@ -33,6 +33,7 @@ from egvs.effects import registry
 from egvs.scenario.model import TERRAIN_KEY, Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.traffic import (
+    class_sizes,
     finished_fcd,
     network,
     recording,
@@ -280,6 +281,10 @@ def _write_run(
     if recorded.types:
         summary["sizes"] = {name: sized.to_json() for name, sized in recorded.types.items()}
     warnings = [*recorded.warnings, *warnings]
+    if recorded.tracks is None:  # of tracks and kinds, the check knows the sizes
+        kinds = {kind.name for kind in scenario.traffic.named_kinds}
+        sizes = {name: size for name, size in recorded.sizes.items() if name not in kinds}
+        warnings += class_sizes.warn_unusual_sizes(sizes, recorded.where)
     summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *(warning.to_json() for warning in warnings)]
     unknown = [{**gap, "frames": [first_frame + frame for frame in gap["frames"]]} for gap in recorded.unknown_boxes]
     return summary | reports, unknown

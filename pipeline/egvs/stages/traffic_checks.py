@@ -21,6 +21,7 @@ from egvs.scenario.model import Scenario
 from egvs.stages import height_checks
 from egvs.stages.inputs import CheckInputs, ErrorCollector
 from egvs.traffic import (
+    class_sizes,
     demand,
     fcd,
     finished_fcd,
@@ -34,6 +35,9 @@ from egvs.traffic import (
 from egvs.traffic.network import ROAD_VCLASSES
 from egvs.traffic.traffic_sources import RecordedTraffic
 from egvs.world import clearances, geolocation
+
+_UNUSUAL_SHARE = 0.25
+"""A recording has some wrong sizes; if so many of its types have one, the units are wrong."""
 
 Rule = Callable[[CheckInputs], Iterator[Diagnostic]]
 
@@ -308,11 +312,12 @@ def _recorded_findings(scenario: Scenario, recorded: RecordedTraffic) -> list[Di
     if scenario.traffic.tracks is None:
         return list(recorded.shared_names.findings(where))
     motor_types = frozenset(name for name, size in recorded.sizes.items() if size.vclass in ROAD_VCLASSES)
+    findings = list(class_sizes.warn_unusual_sizes(recorded.sizes, where, _UNUSUAL_SHARE))
     roads = sumo_folder.read_network(scenario)
     compared = road_check.check_tables(
         recorded.rows, roads, scenario.roi.box, motor_types - recorded.uncounted_types, recorded.shared_names
     )
-    return list(compared.findings(where))
+    return [*findings, *compared.findings(where)]
 
 
 def _fcd_findings(inputs: CheckInputs, classes: Mapping[str, str]) -> list[Diagnostic]:
@@ -350,6 +355,13 @@ def check_vehicle_kinds(inputs: CheckInputs) -> Iterator[Diagnostic]:
         if not any(edge.lanes_for(kind.vclass) for edge in inputs.network.edges):
             problem = f"no lane of the network allows kind {kind.name!r} (vClass {kind.vclass})"
             yield Diagnostic("traffic", f"{key}.kinds", problem, "Use a kind that the network allows.", is_error=True)
+
+
+def warn_vehicle_sizes(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about kinds of vehicles with a size that no vehicle has: centimetres, feet, length and width swapped."""
+    traffic = inputs.scenario.traffic
+    key = f"{sumo_folder.traffic_location(inputs.scenario)}.kinds"
+    yield from class_sizes.warn_unusual_sizes(finished_fcd.sizes_of_kinds(traffic.named_kinds), key)
 
 
 @_for_each_period

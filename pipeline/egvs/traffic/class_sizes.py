@@ -1,10 +1,15 @@
-"""Sizes of road users that a recording does not state, by class, each with its source. Metres."""
+"""Sizes of road users: usual ones of each class, each with its source, and sizes that no vehicle has. Metres."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+from egvs.core.errors import Diagnostic
+from egvs.core.wording import list_first
 from egvs.scenario.traffic_config import TrafficConfig
+from egvs.traffic.network import ROAD_VCLASSES
+from egvs.traffic.vehicle_boxes import VehicleSize
 
 _FLEET = "default fleet"
 _SIND = "mean in SinD, Tianjin"
@@ -56,3 +61,41 @@ def class_sizes(traffic: TrafficConfig) -> dict[str, ClassSize]:
                 kind.length_m, kind.width_m, kind.height_m, sizes[kind.name].vclass, "traffic.kinds"
             )
     return sizes
+
+
+SIZE_LIMITS_M = ((2.0, 80.0), (1.0, 4.0), (0.8, 6.0))
+"""Smallest and largest length, width and height of motor vehicles: from microcars to double trams and heavy loads."""
+
+SMALL_SIZE_LIMITS_M = ((0.8, 4.0), (0.3, 2.0), (0.5, 3.0))
+"""Those of motorcycles and mopeds, with three wheels, too."""
+
+_SMALL_VCLASSES = ("motorcycle", "moped")
+_MAX_LISTED_SIZES = 3
+
+
+def warn_unusual_sizes(
+    sizes: Mapping[str, VehicleSize], where: str, tolerated_share: float = 0.0
+) -> Iterator[Diagnostic]:
+    """Warn about sizes that no motor vehicle has: centimetres, feet, length and width swapped.
+
+    Parameters
+    ----------
+    sizes
+        Size of each vehicle type.
+    where
+        File and key, for the message.
+    tolerated_share
+        Share of the types of motor vehicles that may have such a size; a recording has some.
+    """
+    motor = {name: size for name, size in sizes.items() if size.vclass in ROAD_VCLASSES}
+    unusual = []
+    for name, size in motor.items():
+        limits_m = SMALL_SIZE_LIMITS_M if size.vclass in _SMALL_VCLASSES else SIZE_LIMITS_M
+        size_m = (size.length_m, size.width_m, size.height_m)
+        if not all(low <= value <= high for value, (low, high) in zip(size_m, limits_m, strict=True)):
+            usual = ", ".join(f"{low:g} to {high:g}" for low, high in limits_m)
+            unusual.append(f"{name} ({size.vclass}): {' x '.join(f'{v:g}' for v in size_m)} m (usual: {usual} m)")
+    if len(unusual) > tolerated_share * len(motor):
+        problem = f"expected usual sizes of vehicles, got {list_first(unusual, _MAX_LISTED_SIZES)}"
+        hint = "Check the units, and that lengths and widths are not swapped."
+        yield Diagnostic("vehicle sizes", where, problem, hint)

@@ -81,6 +81,9 @@ ERROR_HEADING_SHARE = 0.25
 WARN_HEADING_DEG, ERROR_HEADING_DEG = 10.0, 20.0
 """Median of the headings off the motion that gets a warning, and that is an error: all are turned by some angle."""
 
+MAX_SPEED_RATIO = 1.5
+"""Median of stated speeds over the speed of the motion, or of its inverse, that gets a warning: km/h are 3.6."""
+
 MIN_POSITIONS = 20
 """Shares of fewer positions are only warnings."""
 
@@ -153,6 +156,8 @@ class RoadCheck:
         Headings of moving vehicles, and those off their motion.
     off_motion_deg
         By how much each heading is off its motion, 0 to 180, of each table.
+    speed_ratios
+        Stated speed over the speed of the motion, of each table; without speeds of 0, which programs write for unknown.
     names
         Signs of shared names.
     """
@@ -167,6 +172,7 @@ class RoadCheck:
     headings: int = 0
     across: int = 0
     off_motion_deg: list[FloatArray] = field(default_factory=list)
+    speed_ratios: list[FloatArray] = field(default_factory=list)
     names: SharedNames = field(default_factory=SharedNames)
 
     def __post_init__(self) -> None:
@@ -193,6 +199,10 @@ class RoadCheck:
         first, second, motion_m = first[counts], second[counts], motion_m[counts]
         motion_rad = np.arctan2(motion_m[:, 1], motion_m[:, 0])
         self._count_headings(yaw_rad[first], yaw_rad[second], motion_rad)
+        speed_m_s = table["speed"].to_numpy()[order]
+        moved_m_s = np.hypot(*motion_m.T) / ((time_ms[second] - time_ms[first]) / 1000.0)
+        ratio = (speed_m_s[first] + speed_m_s[second]) / 2.0 / moved_m_s
+        self.speed_ratios.append(ratio[ratio > 0.0])  # others have no speed
         if self._lanes is not None and len(self._lanes):
             covered = self._is_around(xy_m[first], 0.0) | _is_inside(xy_m[first], *self._lanes.bounds_m)
             first, motion_rad = first[covered], motion_rad[covered]
@@ -260,6 +270,7 @@ class RoadCheck:
         """
         yield from self.names.findings(where)
         yield from self._heading_findings(where)
+        yield from self._speed_findings(where)
         yield from self._position_findings(where)
 
     def _heading_findings(self, where: str) -> Iterator[Diagnostic]:
@@ -276,6 +287,19 @@ class RoadCheck:
         is_error = self._is_error(self.across, self.headings, ERROR_HEADING_SHARE)
         is_error |= self.headings >= MIN_POSITIONS and median_deg > ERROR_HEADING_DEG
         yield Diagnostic("headings", where, problem, hint, is_error)
+
+    def _speed_findings(self, where: str) -> Iterator[Diagnostic]:
+        ratios = np.concatenate([np.empty(0), *self.speed_ratios])
+        if len(ratios) < MIN_POSITIONS:
+            return
+        median = float(np.median(ratios))
+        if 1.0 / MAX_SPEED_RATIO <= median <= MAX_SPEED_RATIO:
+            return
+        problem = (
+            f"expected speeds in m/s, got {median:.2g} times the speed of the motion (median of"
+            f" {number_of(len(ratios), 'speed')})"
+        )
+        yield Diagnostic("speeds", where, problem, "Convert the speeds to m/s, or check the times.")
 
     def _position_findings(self, where: str) -> Iterator[Diagnostic]:
         alignment = self.alignment()

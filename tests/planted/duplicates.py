@@ -1,0 +1,165 @@
+"""What is listed twice, and texts: Unicode, encodings, decimal commas."""
+
+from __future__ import annotations
+
+import unicodedata
+from dataclasses import replace
+
+from tests.planted import scenes
+from tests.planted.case import Case, add, both, fcd, file, key, make, site_names, text, track
+from tests.planted.scenes import street, tracks
+from tests.planted.truth import (
+    STREET,
+    Truth,
+)
+
+RING_TWICE = {**scenes.sensor(STREET), "elevations_deg": (*STREET.elevations_deg, STREET.elevations_deg[0])}
+
+
+def beam_table(truth: Truth, extra: str = "") -> str:
+    """All beams of the sensor as a file."""
+    rows = [f"{e},{a}\n" for a in truth.azimuths_deg for e in truth.elevations_deg]
+    return "elevation_deg,azimuth_deg\n" + "".join(rows) + extra
+
+
+NAMED = replace(STREET, mounts=(("Pfahl ä", STREET.mounts[0][1]), ("Pfahl b", STREET.mounts[1][1])))
+
+DUPLICATES = (
+    Case(
+        "ring listed twice",
+        street,
+        key("sensors.small", RING_TWICE),
+        "sensors.small.elevations_deg",
+        "have the same direction as an earlier one",
+        is_error=False,
+    ),
+    Case(
+        "beam listed twice",
+        make(key("sensors.small", {"beams": "beams.csv", "range_m": 100.0}), add("beams.csv", beam_table(STREET))),
+        file("beams.csv", lambda s: beam_table(s.truth, "-20,360\n")),
+        "beams.csv",
+        "1 of 841 beams have the same direction",
+        is_error=False,
+    ),
+    Case("site listed twice", street, text("sites.csv", "pole_b", "pole_a"), "sites.csv", "two sites 'pole_a'"),
+    Case(
+        "site of two Unicode forms",
+        make(truth=NAMED),
+        text("sites.csv", "Pfahl b", unicodedata.normalize("NFD", "Pfahl ä")),
+        "sites.csv",
+        "differ only in the Unicode of accents",
+    ),
+    Case(
+        "same sensor under two names",
+        street,
+        file("sites.csv", lambda s: scenes.sites([(name, s.truth.mounts[0][1]) for name in ("pole_a", "pole_b")])),
+        "sites",
+        "pole_b = pole_a",
+        is_error=False,
+    ),
+    Case("column of sites twice", street, site_names(pitch_deg="yaw_deg"), "sites.csv", "'yaw_deg' occurs twice"),
+    Case(
+        "two columns for x in FCD",
+        street,
+        text("fcd.csv", "time;id;x;y;z;angle;type;speed", "time;id;x;y;vehicle_x;angle;type;speed"),
+        "fcd.csv",
+        "both stand for 'x'",
+    ),
+    Case(
+        "vehicles that share a name",
+        street,
+        fcd(id=lambda _: "a"),
+        "traffic.fcd = 'fcd.csv'",
+        "two vehicles share a name",
+    ),
+    Case(
+        "tracks that share a name",
+        tracks,
+        track(n=lambda _: "a"),
+        "traffic.tracks",
+        "two vehicles share a name",
+        extension="tracks",
+    ),
+    Case(
+        "each row of FCD twice",
+        street,
+        file("fcd.csv", lambda s: scenes.csv_text([r for row in scenes.fcd_rows(s.truth.frames) for r in (row, row)])),
+        "fcd.csv",
+        "vehicle 'a' occurs twice in frame 0",
+    ),
+    Case(
+        "footprint listed twice",
+        street,
+        file("solids.geojson", lambda s: scenes.solids([*s.truth.solids, s.truth.solids[0]])),
+        "statics",
+        "1 solid has the shape and the position of another one: house",
+        is_error=False,
+    ),
+    Case(
+        "kind listed twice",
+        street,
+        lambda scene: scene.config.update({"traffic.kinds": scene.config["traffic.kinds"] * 2}),
+        "scenario.toml: traffic",
+        "two kinds have the same name: car",
+    ),
+    Case(
+        "member of GeoJSON twice",
+        street,
+        text("solids.geojson", '"crs": null', '"crs": null, "features": []'),
+        "solids.geojson",
+        "features",
+    ),
+    Case(
+        "digits of another script",
+        street,
+        text("sites.csv", "12.2", "\u0661\u0662.2"),
+        "sites.csv: row pole_a",
+        "expected a finite number",
+    ),
+    Case(
+        "minus sign of typography",
+        street,
+        text("sites.csv", "-12.17", "\u221212.17"),
+        "sites.csv: row pole_b",
+        "expected a finite number",
+    ),
+    Case(
+        "sites in Latin-1",
+        make(truth=NAMED),
+        file("sites.csv", lambda s: s.files["sites.csv"].encode("latin-1")),
+        "sites.csv",
+        "cannot be read as CSV",
+    ),
+    Case(
+        "decimal commas of sites",
+        street,
+        file("sites.csv", lambda s: scenes.csv_text(scenes.site_rows(s.truth.mounts), ";").replace(".", ",")),
+        "sites.csv",
+        "columns are separated by ';'",
+    ),
+    Case(
+        "decimal commas of FCD",
+        street,
+        file("fcd.csv", lambda s: s.files["fcd.csv"].replace(".", ",")),
+        "fcd.csv",
+        "invalid value '0,5'",
+    ),
+    Case(
+        "decimal commas of tracks",
+        tracks,
+        both(
+            key("traffic.track_columns", {**scenes.TRACK_COLUMNS, "delimiter": ";"}),
+            file("tracks.csv", lambda s: s.files["tracks.csv"].replace(",", ";").replace(".", ",")),
+        ),
+        "tracks.csv",
+        "expected a number, got '4,5'",
+        extension="tracks",
+    ),
+    Case(
+        "site of another alphabet",
+        make(key("score.keep_visibility", ["pole_a"])),
+        key("score.keep_visibility", ["pole_\u0430"]),
+        "score.keep_visibility",
+        "there is no site 'pole_\u0430'",
+    ),
+)
