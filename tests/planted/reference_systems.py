@@ -43,7 +43,7 @@ def utm(x_m: float, y_m: float) -> tuple[float, float]:
 ROUNDED = 2e-3
 """Coordinates of 10 digits after the point are 1e-5 m apart: few beams change their voxels."""
 
-MAP = file("net.net.xml", lambda _: scenes.network(location=MAPPED))
+MAP = file("net.net.xml", lambda s: scenes.network(s.truth.ground_m, location=MAPPED))
 CRS84, EPSG_32632 = "urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::32632"
 GEO_SOLIDS = file("solids.geojson", lambda s: scenes.solids(s.truth.solids, place=degrees, crs=CRS84))
 UTM_SOLIDS = file("solids.geojson", lambda s: scenes.solids(s.truth.solids, place=utm, crs=EPSG_32632))
