@@ -168,7 +168,7 @@ MOST_LINES = {
     "check": 16_700,  # with comparisons of heights, sizes and speeds, of vehicles with roads and of limits
     "statics": 9_800,
     "scan": 12_300,
-    "traffic": 10_500,
+    "traffic": 10_600,  # with limits of sizes
     "tpog": 4_100,
     "score": 16_800,
     "report": 19_800,
