@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from tests.planted import scenes
 from tests.planted.case import Case, add, both, fcd, file, key, make, site_names, text, track
-from tests.planted.scenes import street, tracks
+from tests.planted.scenes import Scene, street, tracks
 from tests.planted.truth import (
     STREET,
     Truth,
@@ -24,7 +24,52 @@ def beam_table(truth: Truth, extra: str = "") -> str:
 
 NAMED = replace(STREET, mounts=(("Pfahl ä", STREET.mounts[0][1]), ("Pfahl b", STREET.mounts[1][1])))
 
+
+def under_two_names(scene: Scene) -> str:
+    """Each vehicle twice, under another name."""
+    rows = scenes.fcd_rows(scene.truth.frames)
+    return scenes.csv_text([copy for row in rows for copy in (row, {**row, "id": f"{row['id']}2"})], ";")
+
+
 DUPLICATES = (
+    Case(
+        "each vehicle of FCD under two names",
+        street,
+        file("fcd.csv", under_two_names),
+        "scenario.toml: traffic",
+        "vehicles overlap in 100 % of the frames",
+        is_error=False,
+    ),
+    Case(
+        "file of tracks listed twice",
+        tracks,
+        key("traffic.tracks", ["tracks.csv", "tracks.csv"]),
+        "scenario.toml: traffic",
+        "vehicles overlap in 100 % of the frames",
+        is_error=False,
+        extension="tracks",
+    ),
+    Case(
+        "name with a blank at its end",
+        street,
+        text("sites.csv", "pole_b", "pole_a "),
+        "sites.csv: row pole_a",
+        "there are two sites 'pole_a'",
+    ),
+    Case(
+        "decimal comma in a height",
+        street,
+        text("solids.geojson", '"height_m": 6.0', '"height_m": "6,0"'),
+        "solids.geojson: feature 0 (house): height_m",
+        "got '6,0'",
+    ),
+    Case(
+        "nan as a coordinate",
+        street,
+        text("sites.csv", "12.2", "nan"),
+        "sites.csv: row pole_a: y_m",
+        "got 'nan'",
+    ),
     Case(
         "ring listed twice",
         street,

@@ -62,6 +62,27 @@ def above_ground(height_m: float) -> Plant:
 
 HEIGHTS = (
     Case(
+        "property of heights of another program",
+        street,
+        text("solids.geojson", '"height_m"', '"height"'),
+        "solids.geojson: feature 0 (house)",
+        "Did you mean height_m?",
+    ),
+    Case(
+        "heights of footprints in feet",
+        street,
+        text("solids.geojson", '"height_m"', '"height_ft"'),
+        "solids.geojson: feature 0 (house)",
+        "unknown property 'height_ft'",
+    ),
+    Case(
+        "underside above the roof",
+        street,
+        text("solids.geojson", '"base_m": 0.0', '"base_m": 7.0'),
+        "solids.geojson: feature 0 (house)",
+        "expected height_m above base_m = 7, got 6",
+    ),
+    Case(
         "footprints above sea level beside a road at zero",
         street,
         file("solids.geojson", lambda scene: scenes.solids(scene.truth.solids, -HILL_M)),

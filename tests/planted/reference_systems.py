@@ -43,7 +43,7 @@ def utm(x_m: float, y_m: float) -> tuple[float, float]:
 ROUNDED = 2e-3
 """Coordinates of 10 digits after the point are 1e-5 m apart: few beams change their voxels."""
 
-MAP = file("net.net.xml", lambda _: scenes.network(location=MAPPED))
+MAP = file("net.net.xml", lambda s: scenes.network(s.truth.ground_m, location=MAPPED))
 CRS84, EPSG_32632 = "urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::32632"
 GEO_SOLIDS = file("solids.geojson", lambda s: scenes.solids(s.truth.solids, place=degrees, crs=CRS84))
 UTM_SOLIDS = file("solids.geojson", lambda s: scenes.solids(s.truth.solids, place=utm, crs=EPSG_32632))
@@ -68,7 +68,30 @@ def location(offset: str = f"{-EAST_M:.2f},{-NORTH_M:.2f}", projection: str = UT
     return f'<location netOffset="{offset}" projParameter="{projection}"/>'
 
 
+def geo_polygons() -> Scene:
+    """A .poly.xml file in degrees, which says so."""
+    scene = poly_scene(location(), MAPPED)
+    shapes = scenes.polygons(STREET.solids, location=location(), place=degrees)
+    scene.files["solids.poly.xml"] = shapes.replace('fill="1"', 'fill="1" geo="1"')
+    return scene
+
+
 REFERENCE_SYSTEMS = (
+    Case(
+        "polygons in degrees that do not say so",
+        geo_polygons,
+        text("solids.poly.xml", ' geo="1"', ""),
+        "solids.poly.xml",
+        "expected metres of the world frame, got longitude and latitude",
+        tolerance=ROUNDED,
+    ),
+    Case(
+        "region in degrees",
+        make(MAP),
+        key("roi.center_m", [*degrees(20.0, 0.0), 2.5]),
+        "scenario.toml: roi",
+        "no lane passes through the region",
+    ),
     Case(
         "netOffset of polygons",
         partial(poly_scene, location("0.00,0.00", "!")),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -64,7 +65,32 @@ def scan_case(name: str, change: Callable[[FloatArray, Mount], FloatArray], word
     return Case(name, measured, plant, "scan.csv", words, scores=measured_scores)
 
 
+def scan_warning(name: str, change: Callable[[FloatArray, Mount], FloatArray], words: str) -> Case:
+    """A case of a measured scan that may be right."""
+    return replace(scan_case(name, change, words), is_error=False)
+
+
 SCANS = (
+    scan_warning(
+        "scan with two returns for each beam",
+        lambda points_m, _: np.concatenate([points_m, points_m + 0.001]),
+        "1,232 points, but one turn of the sensor has 840 beams",
+    ),
+    scan_warning(
+        "scan with y up",
+        lambda points_m, _: points_m[:, [0, 2, 1]],
+        "1 % of 616 compared points are on surfaces of the static world",
+    ),
+    scan_warning(
+        "scan a metre too high",
+        lambda points_m, _: points_m + np.array([0.0, 0.0, 1.0]),
+        "of 616 compared points are on surfaces of the static world, seen from the site, and no more in",
+    ),
+    scan_warning(
+        "scan in millimetres",
+        lambda points_m, _: points_m * 1000.0,
+        "0 % of 616 compared points are on surfaces of the static world",
+    ),
     scan_case("scan in the sensor's frame", in_sensor_frame, "would be in the sensor's frame"),
     scan_case(
         "scan relative to the sensor",

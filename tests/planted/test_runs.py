@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 
 import egvs
-from egvs.core.errors import InputError
 from egvs.export.export import export_run
-from egvs.stages import score, tpog
 from tests.planted import truth
 from tests.planted.case import fcd
 from tests.planted.heights import RAISED
@@ -19,7 +18,8 @@ from tests.planted.outcome import outcome
 from tests.planted.reference_systems import MAP
 from tests.planted.scenes import Scene, street
 from tests.planted.truth import STREET
-from tests.stage_runner import run_stage
+
+Call = Callable[..., tuple[int, str, str]]
 
 pytestmark = pytest.mark.system
 
@@ -82,16 +82,16 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize(
     ("artefact", "reader"),
-    [("trajectories.parquet", tpog), ("statics.ply", tpog), ("tpog.parquet", score), ("scans.parquet", score)],
+    [("trajectories.parquet", "tpog"), ("statics.ply", "tpog"), ("tpog.parquet", "score"), ("scans.parquet", "score")],
 )
 def test_artefact_of_another_scenario_is_named(
-    runs: dict[str, Path], tmp_path: Path, artefact: str, reader: object
+    runs: dict[str, Path], tmp_path: Path, artefact: str, reader: str, run_egvs: Call
 ) -> None:
     """A stage alone refuses it; a run makes it again, and has the scores of the oracle."""
     out = shutil.copytree(runs["right_run"], tmp_path / "out")
     assert scores_of(out) == pytest.approx(truth.scores(STREET), rel=1e-9)
     shutil.copyfile(runs["other_run"] / artefact, out / artefact)
-    with pytest.raises(InputError, match=artefact):
-        run_stage(reader, egvs.load(runs["right"]), out, jobs=1)
+    code, _, err = run_egvs(reader, runs["right"], "--out", out)
+    assert (code, artefact in err) == (2, True), err
     egvs.run(egvs.load(runs["right"]), out)
     assert scores_of(out) == pytest.approx(truth.scores(STREET), rel=1e-9)

@@ -84,6 +84,27 @@ def kind(name: str, **sizes: float) -> Plant:
 
 TIMES_AND_SIZES = (
     Case(
+        "warm-up longer than the recording",
+        street,
+        key("traffic.warmup_s", 60),
+        "traffic.warmup_s = 60",
+        "the duration of fcd.csv is 19.5 s",
+    ),
+    Case(
+        "steps of azimuth that do not divide the circle",
+        street,
+        key("sensors.small", {**scenes.sensor(STREET), "azimuth_step_deg": 0.7}),
+        "sensors.small",
+        "azimuth_step_deg = 0.7 does not divide 360",
+    ),
+    Case(
+        "range of a sensor in kilometres",
+        street,
+        key("sensors.small", {**scenes.sensor(STREET), "range_m": 0.1}),
+        "site pole_a",
+        "Move it within the range of small, 0.1 m",
+    ),
+    Case(
         "times in milliseconds",
         street,
         fcd(time=lambda row: row["time"] * 1000.0),

@@ -295,11 +295,12 @@ class Georeference:
         self, frame: WorldFrame | None, xy_m: FloatArray, where: str, hint: str
     ) -> CoordinateReading:
         """Return how to convert metres of a file's own world frame, or of this one if the file states none (None)."""
-        world_frame, reading = self.frame, WORLD_READING
-        if frame is not None and world_frame is not None and frame != world_frame:
-            reading = CoordinateReading(
-                "metres of its own <location>", lambda xy: world_frame.from_lon_lat(frame.to_degrees(xy)), where
-            )
+        world_frame = self.frame
+        if frame is None or world_frame is None or frame == world_frame:
+            return self.read_coordinates(xy_m, where, WORLD, hint)
+        reading = CoordinateReading(
+            "metres of its own <location>", lambda xy: world_frame.from_lon_lat(frame.to_degrees(xy)), where
+        )
         self._check_near(reading, xy_m, where, hint)
         return reading
 

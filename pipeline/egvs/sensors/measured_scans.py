@@ -76,11 +76,14 @@ class Reading:
         Where the scan was measured then.
     ends_m
         The points relative to the sensor, along the world axes, (n, 3).
+    is_scaled
+        Whether distances change. Then flat ground near z = 0 says little: points of any height come nearer to it.
     """
 
     name: str
     pose: Pose
     ends_m: FloatArray
+    is_scaled: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,13 +112,15 @@ class Agreement:
         """Share of points that agree, of those that are not on the ground; 0 if all are on the ground."""
         return self.on_structure / max(self.points - self.on_ground, 1)
 
-    def fits_better_than(self, other: Agreement) -> bool:
+    def fits_better_than(self, other: Agreement, *, needs_structure: bool = False) -> bool:
         """Whether clearly more points agree, also of those that are not on the ground."""
         gain = self.share - other.share
         structure_gain = self.structure_share - other.structure_share
         if gain * self.points < MIN_POINTS:
             return False
-        return gain >= MIN_LARGE_GAIN or (gain >= MIN_GAIN and structure_gain >= MIN_STRUCTURE_GAIN)
+        return (gain >= MIN_LARGE_GAIN and not needs_structure) or (
+            gain >= MIN_GAIN and structure_gain >= MIN_STRUCTURE_GAIN
+        )
 
 
 def check_measured_scans(scanner: Scanner, sites: Sequence[Site]) -> Iterator[Diagnostic]:
@@ -177,8 +182,12 @@ def _warn_other_reading(
         points_m = points_m[np.sort(chosen)]
     readings = list(_readings(site, points_m, sites))
     agreements = [compare_with_world(worlds, reading) for reading in readings]
-    agreement, best_agreement = agreements[0], max(agreements, key=lambda other: other.share)
-    best = readings[agreements.index(best_agreement)]
+    agreement, best_agreement, best = agreements[0], agreements[0], readings[0]
+    for reading, other in zip(readings, agreements, strict=True):
+        if reading.is_scaled and not other.fits_better_than(agreement, needs_structure=True):
+            continue
+        if other.share > best_agreement.share:
+            best_agreement, best = other, reading
     text = (
         f"{format_percent(agreement.share, 0)} of {number_of(agreement.points, 'compared point')} are on surfaces of"
         " the static world, seen from the site"
@@ -199,7 +208,7 @@ def _readings(site: Site, points_m: FloatArray, sites: Sequence[Site]) -> Iterat
     yield Reading("", site.pose, points_m - position_m)
     yield Reading("in the sensor's frame", site.pose, points_m @ rotation.T)
     yield Reading("relative to the sensor, along the axes of the world", site.pose, points_m)
-    yield Reading("in feet", site.pose, points_m * _FOOT_M - position_m)
+    yield Reading("in feet", site.pose, points_m * _FOOT_M - position_m, is_scaled=True)
     for name, mirror in _MIRRORED.items():
         yield Reading(f"in the world frame {name}", site.pose, points_m @ mirror - position_m)
         yield Reading(f"{name} about the sensor", site.pose, (points_m - position_m) @ mirror)
