@@ -22,6 +22,7 @@ import egvs
 from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.resource_usage import measure_usage
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.validation import detection_metrics
 from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.detector_runs import SiteDetectionTask
@@ -32,7 +33,7 @@ from egvs.runs.run_context import open_folder
 from egvs.scenario.score_config import DEFAULT_SAMPLED_FRAMES
 from egvs.scoring import target_scores
 from egvs.scoring.scorer import Scorer
-from egvs.scoring.targets import TargetRecord, detection_probability, visible_targets
+from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
@@ -105,7 +106,7 @@ def _score_costs(folder: Path) -> tuple[dict[str, float], int]:
         scan, scanned_s = _timed(partial(scanner.scan_site, site))
         beams = Beams.of(scan)
         _, scored_s = _timed(partial(scorer.score, scan))
-        visible, counted_s = _timed(partial(visible_targets, record, beams, detection_probability(scene, beams.sensor)))
+        visible, counted_s = _timed(partial(visible_targets, record, beams, ReturnProbability.of(scene, beams.sensor)))
         _, models_s = _timed(partial(target_scores.expected_detections, visible))
         return [scanned_s, scored_s, counted_s + models_s, counted_s, models_s]
 

@@ -27,6 +27,7 @@ from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.resource_usage import measure_usage
 from egvs.core.threads import map_ordered, thread_count
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.validation import surrogates
 from egvs.extensions.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
 from egvs.extensions.validation.results import ScoreName
@@ -34,7 +35,7 @@ from egvs.runs import stage_keys
 from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
-from egvs.scoring.targets import TargetRecord, VisibleTargets, detection_probability, visible_targets
+from egvs.scoring.targets import TargetRecord, VisibleTargets, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
@@ -268,7 +269,7 @@ def _visible(scene: Scene, record: TargetRecord, jobs: int | None) -> list[tuple
 
     def of(site: Site) -> tuple[Site, Sensor, VisibleTargets]:
         beams = Beams.of(scanner.scan_site(site))
-        return site, beams.sensor, visible_targets(record, beams, detection_probability(scene, beams.sensor))
+        return site, beams.sensor, visible_targets(record, beams, ReturnProbability.of(scene, beams.sensor))
 
     return list(map_ordered(of, scene.sites, thread_count(jobs)))
 

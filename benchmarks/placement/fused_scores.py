@@ -27,6 +27,7 @@ import numpy as np
 from benchmarks.across_junctions.detections import hits_of
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.validation.detection_metrics import (
     ALL_OBJECTS,
     BLOCKS,
@@ -42,7 +43,7 @@ from egvs.extensions.validation.tables import PlanRunDisplay
 from egvs.scenario.loading import load
 from egvs.scoring.fused_targets import fuse_targets
 from egvs.scoring.target_scores import detection_chances
-from egvs.scoring.targets import TargetRecord, VisibleTargets, detection_probability, visible_targets
+from egvs.scoring.targets import TargetRecord, VisibleTargets, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
@@ -145,7 +146,7 @@ def site_views(held_out: HeldOutTraffic, record: TargetRecord, sites: Sequence[S
     views = {}
     for site in sites:
         beams = Beams.of(scanner.scan_site(site))
-        views[site.name] = visible_targets(record, beams, detection_probability(held_out.scene, beams.sensor))
+        views[site.name] = visible_targets(record, beams, ReturnProbability.of(held_out.scene, beams.sensor))
     return views
 
 

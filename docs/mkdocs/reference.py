@@ -49,6 +49,7 @@ packages may import.
 TABLES: dict[str, str] = {
     "scores": "scores.parquet",
     "scores_by_period": "scores_by_period.parquet",
+    "levels": "levels.parquet",
     "blindspots": "blindspots.parquet",
     "zones": "zones.parquet",
     "trajectories": "trajectories.parquet",

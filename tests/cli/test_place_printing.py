@@ -13,6 +13,7 @@ from rich.console import Console
 
 from egvs.cli import console as cli_console
 from egvs.cli import place
+from egvs.results.levels import NoticedShare
 from egvs.results.plans import FusedPlan, PlannedSensor, PlanStep, SensorPlan
 from egvs.scenario.score_config import PlacementConfig
 
@@ -104,6 +105,9 @@ def test_values_in_fused_clouds_follow_the_assumption(capsys: pytest.CaptureFixt
     better = FusedPlan(steps, ("c", "a"), PlanStep(2, 0.9753, 0.004, True, 0.004, 0.002, 0.98), searched=True)
     text = printed(placed_two(fused=better), capsys)
     assert text.endswith(f"{first}; c, a should find 0.4 ± 0.2 percentage points more there.\n")
+    noticed = FusedPlan(steps, noticed=NoticedShare(0.985, 0.011, 0.985, 0.985))
+    text = printed(placed_two(fused=noticed), capsys)
+    assert text.endswith(f"{first}. People would notice 98 ± 1 % of vehicles there.\n")
 
 
 def test_bits_have_thousands_separators(capsys: pytest.CaptureFixture[str]) -> None:

@@ -64,15 +64,17 @@ from tests.stage_runner import inputs_of, run_stage
 
 # Settings with which an effect changes nothing.
 NEUTRAL = {
-    "hard limit beyond reach": ["effects.range_limit={rated_range_m = 30, reflectivity = 1e4, softness = 0}"],
-    "soft limit far away": ["effects.range_limit={rated_range_m = 30, reflectivity = 1e9}"],
+    "hard limit beyond reach": [
+        "effects.range_limit={rated_range_m = 30, reflectivity = 1e4, softness = 0, dropout = 0}"
+    ],
+    "soft limit far away": ["effects.range_limit={rated_range_m = 30, reflectivity = 1e15, dropout = 0}"],
     "no rain": ["effects.rain.rate_mm_h=0"],
     "next to no rain": ["effects.rain.rate_mm_h=1e-25"],
     "clear air": ["effects.fog.visibility_m=1e18"],
     "no dropout": ["effects.dropout.share=0"],
     "all of them": [
         "effects.rain.rate_mm_h=0", "effects.fog.visibility_m=1e18", "effects.dropout.share=0",
-        "effects.range_limit.rated_range_m=1e4", "effects.range_limit.softness=0",
+        "effects.range_limit={rated_range_m = 1e4, softness = 0, dropout = 0}",
     ],
 }  # fmt: skip
 
@@ -125,7 +127,7 @@ def test_worse_conditions_never_raise_a_score(score_run: tuple[Path, Path], seri
 
 def test_detect_effects_multiply(one_beam_run: tuple[Path, Path]) -> None:
     """In the voxel at 20.25 m: 3/4 are not dropped, half are detected; rain and fog attenuate the rest."""
-    half = "effects.range_limit={rated_range_m = 20.25, rated_reflectivity = 0.1}"
+    half = "effects.range_limit={rated_range_m = 20.25, rated_reflectivity = 0.03, dropout = 0}"
     dropout, rain, fog = "effects.dropout.share=0.25", "effects.rain.rate_mm_h=30", "effects.fog.visibility_m=200"
     assert hits_along_beam(one_beam_run, half, dropout)[20] == 0.375
     assert hits_along_beam(one_beam_run, dropout, half)[20] == 0.375
@@ -155,8 +157,10 @@ def test_why_idle_of_detect_effects(score_run: tuple[Path, Path]) -> None:
     assert make_effect("rain", rate_mm_h=0).why_idle(scene) == "rate_mm_h is 0"
     assert make_effect("dropout", share=0).why_idle(scene) == "share is 0"
     assert (
-        make_effect("range_limit", softness=0, rated_range_m=300).why_idle(scene) == "every beam ends before the limit"
+        make_effect("range_limit", softness=0, dropout=0, rated_range_m=600).why_idle(scene)
+        == "every beam ends before the limit"
     )
+    assert make_effect("range_limit", softness=0, rated_range_m=600).why_idle(scene) is None
     for name, parameters in {
         "rain": {"rate_mm_h": 1},
         "dropout": {"share": 0.1},
@@ -166,7 +170,7 @@ def test_why_idle_of_detect_effects(score_run: tuple[Path, Path]) -> None:
         assert make_effect(name, **parameters).why_idle(scene) is None
     assert make_effect("range_limit", softness=0, rated_range_m=30).why_idle(scene) is None
     with pytest.raises(InputError, match="sensor small: rated_range_m is missing"):
-        make_effect("range_limit", softness=0).why_idle(scene)
+        make_effect("range_limit", softness=0, dropout=0).why_idle(scene)
 
 
 @pytest.mark.parametrize("name", ACTIVE)

@@ -42,7 +42,8 @@ def test_hard_limit_equals_hand_computed_hits(one_beam_run: tuple[Path, Path]) -
     m."""
     result = hits_along_beam(
         one_beam_run,
-        "effects.range_limit={rated_range_m = 40, rated_reflectivity = 0.8, reflectivity = 0.2, softness = 0}",
+        "effects.range_limit={rated_range_m = 40, rated_reflectivity = 0.8, reflectivity = 0.2,"
+        " softness = 0, dropout = 0}",
     )
     np.testing.assert_array_equal(result, [1.0] * 20 + [0.0] * 60)
 
@@ -52,7 +53,7 @@ def test_incidence_equals_hand_computed_hits(one_beam_run: tuple[Path, Path]) ->
     result = hits_along_beam(
         one_beam_run,
         "effects.range_limit={rated_range_m = 40, rated_reflectivity = 0.8, reflectivity = 0.4, incidence_deg = 60,"
-        " softness = 0}",
+        " softness = 0, dropout = 0}",
     )
     np.testing.assert_array_equal(result, [1.0] * 20 + [0.0] * 60)
 
@@ -61,22 +62,24 @@ def test_soft_limit_equals_hand_computed_hits(one_beam_run: tuple[Path, Path]) -
     """Rated 20.25 m: one half there. At 10.25 m the power is (20.25 / 10.25)^2 = 3.903 times the threshold, ln =
     1.3618; over a softness of 1 the normal distribution says 0.9134."""
     result = hits_along_beam(
-        one_beam_run, "effects.range_limit={rated_range_m = 20.25, rated_reflectivity = 0.1, softness = 1}"
+        one_beam_run,
+        "effects.range_limit={rated_range_m = 20.25, rated_reflectivity = 0.03, softness = 1, dropout = 0}",
     )
     assert result[20] == 0.5
     assert result[0] == pytest.approx(0.9134, abs=5e-5)
 
 
-def test_default_softness_agrees_with_a_datasheet() -> None:
-    """Ouster OS1: 10 % targets 50 % at 55 m and 90 % at 45 m."""
+def test_flat_target_of_a_datasheet() -> None:
+    """Ouster OS1: 10 % targets 50 % at 55 m and 90 % at 45 m, a softness of 0.3; on cars it is 1."""
     os1 = sensor.CATALOGUE["OS1-128"]
-    at_45, at_55 = make_effect("range_limit").detect(np.array([45.0, 55.0]), os1)
+    flat = make_effect("range_limit", reflectivity=0.1, softness=0.3, dropout=0)
+    at_45, at_55 = flat.detect(np.array([45.0, 55.0]), os1)
     assert at_55 == pytest.approx(0.5, abs=1e-12)
     assert at_45 == pytest.approx(0.9, abs=0.015)
 
 
-def test_everything_is_detected_next_to_the_sensor() -> None:
-    assert make_effect("range_limit").detect(np.array([0.0, 1e-6]), SENSOR).tolist() == [1.0, 1.0]
+def test_everything_but_the_dropout_is_detected_next_to_the_sensor() -> None:
+    assert make_effect("range_limit").detect(np.array([0.0, 1e-6]), SENSOR).tolist() == [0.95, 0.95]
 
 
 # Sensors
@@ -136,7 +139,7 @@ def test_range_limit_is_active_for_measured_scans(score_run: tuple[Path, Path]) 
     (score_run[0] / "one.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\n")
     (score_run[0] / "cloud.csv").write_text("x_m,y_m,z_m\n20,0,1\n")
     measured = make_scene(score_run, "sites.points='cloud.csv'", "sites.file='one.csv'")
-    assert make_effect("range_limit", softness=0, rated_range_m=300).why_idle(measured) is None
+    assert make_effect("range_limit", softness=0, rated_range_m=600).why_idle(measured) is None
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,9 @@ import pytest
 
 import egvs
 from egvs.core.errors import MissingBackendError, RunError
-from egvs.effects import registry
+from egvs.effects import registry, returns
 from egvs.effects.base import Detect
 from egvs.scenario.effects_config import EffectParameters
-from egvs.scoring import visibility
 from tests import processes
 from tests.core.test_plugins import install, site  # noqa: F401  the fixture
 from tests.effects.detect_helpers import ACTIVE
@@ -218,13 +217,13 @@ class Given(Detect[EffectParameters]):
 )
 def test_rejects_invalid_shares(given: object, result: str) -> None:
     with pytest.raises(RunError, match=rf"^effects\.given: expected one share from 0 to 1 .*, got {result}$"):
-        visibility._checked_shares(Given(EffectParameters()), given, 2, "crossings")
+        returns.checked_shares(Given(EffectParameters()), given, 2, "crossings")
 
 
 def test_accepts_empty_and_boolean_shares() -> None:
     effect = Given(EffectParameters())
-    assert visibility._checked_shares(effect, np.ones(0), 0, "ranges").size == 0
-    assert visibility._checked_shares(effect, np.array([True, False]), 2, "ranges").tolist() == [True, False]
+    assert returns.checked_shares(effect, np.ones(0), 0, "ranges").size == 0
+    assert returns.checked_shares(effect, np.array([True, False]), 2, "ranges").tolist() == [True, False]
 
 
 @pytest.mark.slow

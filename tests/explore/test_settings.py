@@ -55,7 +55,7 @@ def test_effect_can_be_switched_off(mini: Path, tmp_path: Path) -> None:
     dry = Settings(None, "egvs", frozenset())
     tried = SessionFactory(rainy, tmp_path / "scratch").session(dry)
     assert dict(tried.candidates["pole_a"].scores) == {
-        key: scored(mini)["pole_a"][key] for key in ("egvs", "entropy_seen", "expected_detections")
+        key: scored(mini)["pole_a"][key] for key in ("egvs", "entropy_seen", "expected_detections", "noticed")
     }
     assert rainy.candidates["pole_a"].scores["egvs"] < tried.candidates["pole_a"].scores["egvs"]
     assert dry.overrides(rainy.scenario) == ("without effects.rain",)

@@ -133,6 +133,22 @@ def test_values_are_those_of_scans_made_by_hand(placed: SimpleNamespace) -> None
 
 
 @pytest.mark.slow
+def test_what_people_notice_of_a_plan_is_a_mean_over_points_of_all_sensors(placed: SimpleNamespace) -> None:
+    """The points of both sensors, added here, on the curve of cars as the documentation states its values."""
+    points = sum(placed.views[sensor.site].points for sensor in placed.placement.sensors)
+    at = np.log1p([0.0, 1.0, 10**0.5, 50**0.5, 200**0.5, 1000**0.5, 5000**0.5, 30000**0.5, 300.0])
+    shares = [0.0, 0.32, 0.458352, 0.458352, 0.6, 0.865902, 0.865902, 0.94, 0.96]
+    noticed = placed.placement.fused.noticed
+    assert noticed.value == pytest.approx(np.interp(np.log1p(points), at, shares).mean(), abs=1e-5)
+    assert noticed.low == noticed.high == pytest.approx(noticed.value, rel=1e-12)
+    hats = [np.interp(np.log1p(points), at, row).mean() for row in np.eye(9)[1:]]
+    pools = [hats[0], hats[1] + hats[2], hats[3], hats[4] + hats[5], hats[6], hats[7]]
+    of_curve = np.array(pools) * [0.06, 0.073110, 0.14, 0.038411, 0.03, 0.02]
+    assert noticed.se**2 > (of_curve**2).sum()  # the rest is the error of the traffic
+    assert noticed.se**2 < (of_curve**2).sum() + 0.05**2
+
+
+@pytest.mark.slow
 def test_no_pair_of_candidates_finds_more(placed: SimpleNamespace) -> None:
     """Here the local search ends at the best of all pairs."""
     fused = placed.placement.fused

@@ -9,11 +9,14 @@ import pytest
 
 from egvs.core.errors import Diagnostic
 from egvs.drawing.run_figures import site_caption
-from egvs.report import ranking_text
+from egvs.report import ranking_text, sensor_text
 from egvs.report.sections import describe_poles_on_road
 from egvs.results.labels import SCORE_LABELS
+from egvs.results.levels import NoticedShare
 from egvs.results.ranking import Pole, RankedSite, Ranking, ScoreValue
+from egvs.results.sensors import SensorComparison
 from egvs.scenario.loading import load
+from egvs.scenario.score_config import CostsConfig
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
@@ -56,6 +59,88 @@ def test_sentences_for_a_score_over_vehicles() -> None:
     )
     assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").companion_score is SCORE_LABELS["expected_detections"]
     assert ranking(("a", 50.0, 1, 0.5, 1.0)).companion_score is None
+
+
+def with_noticed(*rows: tuple[str, float, float], low: float = 0.0, high: float = 0.0) -> Ranking:
+    """From (site, share found, share noticed), best first; ``low`` and ``high`` are how far the bounds are off."""
+    sites = []
+    for site, (_, _, noticed) in zip(
+        by_vehicles(*((name, 1.0, found) for name, found, _ in rows)).sites, rows, strict=True
+    ):
+        others = (*site.others, ScoreValue("noticed", noticed, 0.017))
+        sites.append(replace(site, others=others, noticed_low=noticed - low, noticed_high=noticed + high))
+    return Ranking(tuple(sites), tuple(sites[:1]), ())
+
+
+BOTH = ("cluster", "pointpillars")
+
+
+def test_the_headline_names_whose_level_it_is() -> None:
+    ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
+    assert ranking_text.headline(ranked, has_traffic=True, detectors=BOTH) == (
+        "a is the best of 2 sites: detectors (cluster, pointpillars) should find 84.1 % of vehicles; people would "
+        "notice 90 ± 2 % in its sweeps"
+    )
+    assert ranking_text.headline(with_noticed(("a", 0.841, 0.897)), has_traffic=True, detectors=("cluster",)) == (
+        "a, the only site: the detector cluster should find 84.1 % of vehicles; people would notice 90 ± 2 % in its "
+        "sweeps"
+    )
+    tie = with_noticed(("a", 0.841, 0.897), ("b", 0.841, 0.897))
+    assert ranking_text.headline(replace(tie, best=tie.sites), has_traffic=True, detectors=BOTH).startswith(
+        "All 2 sites score the same: detectors (cluster, pointpillars) should find 84.1 % of vehicles; "
+    )
+    both_first = with_noticed(("a", 0.841, 0.897), ("b", 0.841, 0.897), ("c", 0.5, 0.6))
+    assert ranking_text.headline(replace(both_first, best=both_first.sites[:2]), True, BOTH).startswith(
+        "a and b share first place among 3 sites; from a, detectors (cluster, pointpillars) should find 84.1 %"
+    )
+    without = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8))  # a run of an earlier version
+    assert ranking_text.headline(without, has_traffic=True, detectors=BOTH) == (
+        "a is the best of 2 sites: detectors (cluster, pointpillars) should find 87.1 % of vehicles"
+    )
+
+
+def test_a_level_that_nothing_supports_is_a_range() -> None:
+    ranked = with_noticed(("a", 0.841, 0.7), ("b", 0.8, 0.89), low=0.02, high=0.09)
+    assert not ranked.sites[0].noticed.is_measured
+    assert ranking_text.headline(ranked, has_traffic=True, detectors=BOTH).endswith(
+        "people would notice 65 to 80 % in its sweeps"
+    )
+    assert with_noticed(("a", 0.841, 0.7), low=0.02, high=0.07).sites[0].noticed.text == "70 ± 2 %"
+    assert [NoticedShare(0.5, None, low, high).cell for low, high in ((0.45, 0.65), (0.0, 1.0), (0.81, 0.99))] == [
+        "45 to 65 %", "0 to 100 %", "80 to 100 %",
+    ]  # fmt: skip
+    assert NoticedShare(0.5, None, 0.5, 0.5).text == "50 %"
+
+
+def test_a_pole_from_which_people_notice_clearly_more_is_named() -> None:
+    ranked = with_noticed(("a", 0.9, 0.80), ("b", 0.8, 0.809), ("c", 0.7, 0.85), ("d", 0.6, 0.5))
+    assert ranking_text.noticed_preference(ranked) == (
+        "People would notice more from c (85 %) than from a (80 %); sites are ranked by what detectors should find."
+    )
+    same_pole = tuple(replace(site, pole="p" if site.site in "ac" else site.pole) for site in ranked.sites)
+    assert ranking_text.noticed_preference(replace(ranked, sites=same_pole)) == ""
+    assert ranking_text.noticed_preference(with_noticed(("a", 0.9, 0.80), ("b", 0.8, 0.809))) == ""
+    assert ranking_text.noticed_preference(by_vehicles(("a", 1.0, 0.9), ("b", 1.0, 0.8))) == ""
+
+
+def test_without_losses_the_share_noticed_is_an_upper_limit() -> None:
+    ranked = with_noticed(("a", 0.9, 0.80))
+    lossless = load(SCENARIOS / "demo", ["effects.range_limit=false"])
+    assert ranking_text.lossless_note(ranked, lossless).endswith("read that share as an upper limit.")
+    assert ranking_text.lossless_note(ranked, load(SCENARIOS / "demo")) == ""
+    assert ranking_text.lossless_note(by_vehicles(("a", 1.0, 0.9)), lossless) == ""
+
+
+def test_a_sensor_with_which_people_notice_clearly_more_is_named() -> None:
+    ranked = with_noticed(("a", 0.9, 0.80), ("b", 0.8, 0.82))
+    sites = [replace(site, sensor=sensor) for site, sensor in zip(ranked.sites, ("VLP-16", "OS1-64"), strict=True)]
+    comparison = SensorComparison.of_run(sites, CostsConfig())
+    assert sensor_text.noticed_preference(comparison) == (
+        "People would notice more with OS1-64 (82 %) than with VLP-16 (80 %); the differences above are of what "
+        "detectors should find."
+    )
+    alike = [replace(site, others=(*site.others[:1], ScoreValue("noticed", 0.8, 0.02))) for site in sites]
+    assert sensor_text.noticed_preference(SensorComparison.of_run(alike, CostsConfig())) == ""
 
 
 def test_gain_of_a_pole_is_in_percentage_points_for_shares_and_relative_otherwise() -> None:

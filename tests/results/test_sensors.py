@@ -141,6 +141,6 @@ def test_difference_in_bits_has_no_percentage_points() -> None:
 
 
 def test_several_sensors_without_range_limit_have_a_note() -> None:
-    assert range_note(["a", "b", "a"], is_modelled=False).endswith("Try --set effects.range_limit={}.")
+    assert range_note(["a", "b", "a"], is_modelled=False).endswith("leave out effects.range_limit = false.")
     assert range_note(["a", "b", "a"], is_modelled=True) == ""
     assert range_note(["a", "a"], is_modelled=False) == ""

@@ -44,7 +44,10 @@ RANGE_M = 200.0
 
 
 def load(name):
-    return loading.load(f"scenarios/{name}", [*SHORT, f'score.keep_visibility=["{SITES[name]}", "{ALSO[name]}"]'])
+    return loading.load(
+        f"scenarios/{name}",
+        [*SHORT, "effects.range_limit=false", f'score.keep_visibility=["{SITES[name]}", "{ALSO[name]}"]'],
+    )
 
 
 @pytest.fixture(scope="module")

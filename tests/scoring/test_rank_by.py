@@ -19,7 +19,7 @@ from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import read_frames
 from egvs.core.errors import InputError, collect_warnings
 from egvs.scenario import loading
-from egvs.scenario.score_config import VEHICLE_SCORES, OtherScore, ScoreConfig
+from egvs.scenario.score_config import VEHICLE_SCORES, RankingScore, ScoreConfig
 from egvs.scoring.egvs import binary_entropy
 from egvs.scoring.target_scores import TARGET_SCORES, expected_detections
 from egvs.scoring.targets import TargetRecord, visible_targets
@@ -64,14 +64,15 @@ def test_target_scores_match_slow_reference(mini: Path, tmp_path: Path, monkeypa
     assert 1.0 <= widened[0] < 2.0
 
 
-@pytest.mark.parametrize("name", ["egvs", *get_args(OtherScore)])
+@pytest.mark.parametrize("name", get_args(RankingScore))
 def test_sites_rank_by_named_score(mini: Path, tmp_path: Path, name: str) -> None:
     (mini / "sites.csv").write_text(SITES)
     rows = run(mini, tmp_path / "run", f"score.rank_by={name}", "score.others=[]")
     assert by_rank(rows, name)
     columns = set(next(iter(rows.values())))
     assert {name, f"{name}_se", "egvs_se", "beats_next"} <= columns
-    assert columns.isdisjoint(set(TARGET_SCORES) - {name})
+    computed = {name, "noticed"} if name == "expected_detections" else {name}
+    assert columns.isdisjoint(set(TARGET_SCORES) - computed)
     assert parquet.read_metadata(tmp_path / "run" / "scores.parquet", "scores")["rank_by"] == name
     ranked = sorted(rows.values(), key=lambda row: row["rank"])
     assert ranked[-1]["beats_next"] == 1.0
@@ -217,7 +218,7 @@ def test_scores_over_vehicles_are_the_target_scores() -> None:
     assert set(VEHICLE_SCORES) == set(TARGET_SCORES)
 
 
-@pytest.mark.parametrize("other", VEHICLE_SCORES)
+@pytest.mark.parametrize("other", [name for name in VEHICLE_SCORES if name in get_args(RankingScore)])
 def test_sampled_frames_need_a_score_over_vehicles_or_blind_spots(mini: Path, other: str) -> None:
     without = ["score.blindspots=false", "score.others=['coverage']", "score.sampled_frames=20"]
     with pytest.raises(InputError, match="score: sampled_frames has no effect without blind spots"):
@@ -256,7 +257,7 @@ def test_warns_of_undefined_target_scores(mini: Path, tmp_path: Path) -> None:
     values = read_scores(tmp_path / "run" / "scores.parquet")["expected_detections"].to_pylist()
     assert read_tpog(tmp_path / "run" / "tpog.parquet").counts.any()
     nobody = "no vehicle has its centre in the region of interest in the 40 frames examined"
-    assert [it.problem for it in told] == [f"{nobody}: no value for expected_detections"]
+    assert [it.problem for it in told] == [f"{nobody}: no value for expected_detections and noticed"]
     assert math.isnan(values[0])
 
 

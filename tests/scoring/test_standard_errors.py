@@ -275,6 +275,7 @@ def test_without_errors_the_scores_are_the_same(mini: Path, tmp_path: Path, chan
         "behind_best_se",
         "best_beats",
         "expected_detections_se",
+        "noticed_se",
     }
     assert table.select(plain.column_names) == plain
     assert ranking_table(RankedSite.from_table(plain)).caption is None

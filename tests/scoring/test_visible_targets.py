@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import egvs
+from egvs.effects.returns import ReturnProbability
 from egvs.scoring import targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors import sensor
@@ -278,9 +279,9 @@ def test_a_chance_of_one_is_no_effect():
 def test_detection_probability_with_and_without_dropout(tmp_path):
     folder = write_mini(tmp_path / "mini")
     plain = egvs.build_scene(egvs.load(folder))
-    assert targets.detection_probability(plain, sensor.CATALOGUE["VLP-16"]) is None
+    assert ReturnProbability.of(plain, sensor.CATALOGUE["VLP-16"]) is None
     lossy = egvs.build_scene(egvs.load(folder, ["effects.dropout.share=0.25"]))
-    noticed = targets.detection_probability(lossy, sensor.CATALOGUE["VLP-16"])
+    noticed = ReturnProbability.of(lossy, sensor.CATALOGUE["VLP-16"])
     assert noticed is not None and noticed(np.array([1.0, 50.0])).tolist() == [0.75, 0.75]
 
 

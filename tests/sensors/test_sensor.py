@@ -552,7 +552,7 @@ def test_list_has_one_line_per_sensor_that_fits_a_narrow_terminal(run_egvs) -> N
 
 
 def test_list_converts_rated_ranges_as_the_effect_does(run_egvs) -> None:  # type: ignore[no-untyped-def]
-    effect = RangeLimit(RangeLimitParameters())
+    effect = RangeLimit(RangeLimitParameters(reflectivity=0.1))
     table = run_egvs("sensors")[1].splitlines()
     for name, entry in CATALOGUE.items():
         line = next(line for line in table if line.startswith(f"{name} "))
@@ -565,6 +565,8 @@ def test_details_of_a_sensor_have_source_and_assumptions(run_egvs) -> None:  # t
     for name in ("AT128", "VLP-16"):
         assert f"source: {CATALOGUE[name].source}\n" in out
         assert f"assumed: {CATALOGUE[name].assumed}\n" in out
+        assert f"rated range: {CATALOGUE[name].rated_source}" in out
+    assert "half are lost at 110 m, 5 % at 48 m, and 5 % at any range (reflectivity 0.03, softness 1:" in out
     assert "-59.95 to 59.95" in out
     code, out, error = run_egvs("sensors", "AT129")
     assert (code, out) == (2, "")

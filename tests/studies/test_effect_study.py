@@ -50,18 +50,23 @@ def test_statuses_of_effects_in_plain_scene(mini: Path) -> None:
     }
     assert statuses["rain"][1].startswith("the weather decides; by its formula, ")
     assert statuses["foliage"][1] == "not called for: there is no closed tree crown"
-    assert "cannot act here: rated_range_m is missing" in statuses["range_limit"][1]
+    assert "not simulated for small, which has no rated range" in statuses["range_limit"][1]
     assert "pedestrians and bicycles cannot be added to recorded traffic" in statuses["pedestrians_bicycles"][1]
     assert "no vehicle type has more than one part" in statuses["articulated"][1]
     assert "flat" in statuses["slope"][1] or "no network" in statuses["slope"][1] or "relief" in statuses["slope"][1]
 
 
-def test_range_limit_beyond_region_has_little_effect_before_a_run(mini: Path) -> None:
+def test_losses_are_on_where_the_region_reaches_beyond_their_range(mini: Path) -> None:
     """Ranges of 3000 m and 30 m; the region is 50 m wide."""
-    for rated_m, state in ((3000, "little"), (30, "called for")):
+    for rated_m, state, why in (
+        (3000, "off", "not called for: small lose at most 5 % of returns from the region"),
+        (30, "on", "losses of returns are simulated for small"),
+    ):
         statuses = states(mini, f"sensors.small.rated_range_m={rated_m}")["range_limit"]
         assert statuses[0] == state
-        assert ("100 % of returns" in statuses[1]) == (state == "little")
+        assert why in statuses[1]
+    rated = "sensors.small.rated_range_m=30"
+    assert states(mini, rated, "effects.range_limit=false")["range_limit"] == ("off", "effects.range_limit = false")
 
 
 def changes_of_runs(before: Path, after: Path, score: str) -> list[float]:

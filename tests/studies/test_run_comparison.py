@@ -22,7 +22,8 @@ from egvs.artefacts.run_record import RunRecord
 from egvs.cli import console as cli_console
 from egvs.cli import study_tables
 from egvs.core.errors import InputError
-from egvs.report.sensor_text import SENSOR_EVIDENCE
+from egvs.core.files import add_checksum
+from egvs.report.sensor_text import SENSOR_EVIDENCE, describe_losses
 from egvs.results.ranking import RankedSite, Ranking, ScoreValue, share_of_limit
 from egvs.scenario.score_config import CostsConfig
 from egvs.studies import run_comparison
@@ -105,14 +106,16 @@ def made_run(label: str, *sites: RankedSite, **settings: object) -> ComparedRun:
     return ComparedRun(label, Path(label.lower()), Ranking.of(sites), settings, {})
 
 
-def test_range_limit_is_enabled_by_its_table_or_any_of_its_keys() -> None:
-    def has_range_limit(**settings: object) -> bool:
-        return made_run("A", row("p", 9.0), **settings).has_range_limit
+def test_losses_act_unless_they_are_off_or_a_sensor_has_no_rated_range() -> None:
+    def has_losses(*unrated: str, **settings: object) -> bool:
+        return replace(made_run("A", row("p", 9.0), **settings), unrated=unrated).has_losses
 
-    assert has_range_limit(**{"effects.range_limit": {}})
-    assert has_range_limit(**{"effects.range_limit.softness": 0.2})
-    assert not has_range_limit(**{"effects.range_limit": None})
-    assert not has_range_limit(**{"effects.rain.rate_mm_h": 5.0})
+    for settings in ({}, {"effects.range_limit": None}, {"effects.rain.rate_mm_h": 5.0}):
+        assert has_losses(**settings)
+        assert not has_losses("s", **settings)
+    assert has_losses("s", **{"effects.range_limit": {}})
+    assert has_losses("s", **{"effects.range_limit.softness": 0.2})
+    assert not has_losses(**{"effects.range_limit": False})
 
 
 def test_rank_agreement_computed_by_hand() -> None:
@@ -352,7 +355,7 @@ def test_sentences_are_broken_between_words(width: int, monkeypatch: pytest.Monk
     paragraph = lines[first : lines.index("", first)]
     assert len(paragraph) > 2
     assert max(map(len, paragraph)) <= width
-    assert " ".join(line.rstrip() for line in paragraph) == SENSOR_EVIDENCE
+    assert " ".join(line.rstrip() for line in paragraph) == f"{SENSOR_EVIDENCE} {describe_losses(has_interval=False)}"
 
 
 @pytest.mark.parametrize(("width", "is_table"), [(80, False), (160, True)])

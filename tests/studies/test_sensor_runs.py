@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import egvs
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
 from egvs.sensors.sensor import CATALOGUE
+from egvs.studies.run_comparison import compare_runs
 from egvs.studies.sensor_runs import SensorRun, SensorRuns, prepare_runs, run_sensors
 
 
@@ -63,14 +65,50 @@ def test_settings_go_to_the_runs_and_costs_to_the_comparison(here: Path, run_egv
         assert "range_limit" in record.scenario["effects"]
         assert not any(key.startswith("costs") for key in record.overrides)
     assert "4,000" in printed
-    assert "short rated range" not in printed
+    assert "Losses of returns are not simulated" not in printed
 
 
 def test_range_is_named_as_not_modelled(here: Path, run_egvs) -> None:
-    printed = run_egvs("compare", "mini", "--sensors", "VLP-16,VLP-32C")[1]
-    notes = [line for line in printed.splitlines() if "short rated range" in line]
-    assert len(notes) == 1
-    assert notes[0].endswith("Try --set effects.range_limit={}.")
+    off = ("--set", "effects.range_limit=false")
+    for options, count in (((), 0), (off, 1)):
+        printed = run_egvs("compare", "mini", "--sensors", "VLP-16,VLP-32C", *options)[1]
+        assert printed.count("Losses of returns are not simulated for every sensor") == count
+        assert "Losses of returns (reflectivity 0.03" in printed
+
+
+def test_sensors_are_compared_with_losses_also_where_one_needs_none(mini: Path) -> None:
+    near, far = prepare_runs(mini, "VLP-16,Livox Tele-15", ["roi.size_m=[30,20,5]"]).runs
+    assert near.scenario.effects.range_limit is None
+    assert far.scenario.effects.range_limit is not None
+    assert "range_limit=on" in far.folder.name
+    for off in prepare_runs(mini, "VLP-16,Livox Tele-15", ["effects.range_limit=false"]).runs:
+        assert off.scenario.effects.range_limit is False
+
+
+def test_interval_of_reflectivity_is_part_of_the_error(here: Path, run_egvs) -> None:
+    """The difference of two sensors, at both ends of the interval, in the runs that differ in nothing else."""
+    assert run_egvs("compare", "mini", "--sensors", "VLP-16,OS1-64")[0] == 0
+    folders = [folder for folder in (here / "runs").iterdir()]
+    sensors = compare_runs(folders).sensors
+    assert sensors is not None and sensors.has_loss_interval
+    gain = sensors.results[1].gain
+    assert gain is not None and gain.difference.se is not None
+
+    scores = []
+    for rho in (0.03, 0.06):
+        settings = ("--set", f"effects.range_limit.reflectivity={rho}")
+        assert run_egvs("compare", "mini", "--sensors", "VLP-16,OS1-64", *settings)[0] == 0
+        of_rho = [folder for folder in (here / "runs").iterdir() if f"reflectivity={rho}" in folder.name]
+        other = compare_runs(of_rho).sensors
+        assert other is not None and not other.has_loss_interval
+        by_sensor = {result.mount.sensor: result.mount.site.score for result in other.results}
+        scores.append(by_sensor["OS1-64"] - by_sensor["VLP-16"])
+        if rho == 0.03:
+            plain = other.results[1].gain
+    assert plain is not None and plain.difference.value == pytest.approx(gain.difference.value)
+    expected = math.hypot(plain.difference.se or 0.0, abs(scores[1] - scores[0]) / math.sqrt(3))
+    assert gain.difference.se == pytest.approx(expected, rel=1e-6)
+    assert gain.difference.se > (plain.difference.se or 0.0)
 
 
 def test_run_is_compared_with_its_own_settings(here: Path, mini: Path) -> None:
@@ -120,7 +158,9 @@ def test_all_sensors_are_those_of_the_scenario_and_the_catalogue(mini: Path) -> 
 def test_says_which_sensors_see_a_part_of_the_circle_where_all_sites_look_east(mini: Path) -> None:
     (note,) = prepare_runs(mini, "VLP-16,AT128,RS-M1").notes
     assert note.startswith("AT128 and RS-M1 do not see the full circle")
-    assert prepare_runs(mini, "VLP-16,small").notes == ()
+    (unrated,) = prepare_runs(mini, "VLP-16,small").notes
+    assert unrated.startswith("small has no rated range: its losses of returns are not simulated")
+    assert unrated.endswith("Enter rated_range_m and rated_reflectivity under [sensors.small]")
     assert prepare_runs(mini, "VLP-16,AT128", ["sites.yaw_deg=90"]).notes == ()
 
 

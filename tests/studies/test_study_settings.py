@@ -119,7 +119,9 @@ def test_tries_unnamed_effects_that_act_in_the_scene(mini: Path) -> None:
     rated = study_settings.list_variants(
         egvs.load(mini, ["sites.sensor=VLP-16"])
     )  # it has a rated range, the scenario's sensor has none
-    assert "with range_limit" in {s.name for s in rated}
+    assert "without range_limit" in {s.name for s in rated}, "it acts by itself"
+    off = study_settings.list_variants(egvs.load(mini, ["sites.sensor=VLP-16", "effects.range_limit=false"]))
+    assert "with range_limit" in {s.name for s in off}
     assert all(
         egvs.load(mini, s.overrides).effects.named.keys() == {s.name.removeprefix(study_settings.WITH_PREFIX)}
         for s in with_.values()

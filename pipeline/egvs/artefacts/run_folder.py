@@ -83,6 +83,7 @@ class RunFolder:
     scores = RunFile("scores.parquet", "score")
     visibility = RunFile("visibility.parquet", "score")
     scores_by_period = RunFile("scores_by_period.parquet", "score")
+    levels = RunFile("levels.parquet", "score")
     blindspots = RunFile("blindspots.parquet", "score")
     zones = RunFile("zones.parquet", "score")
     report = RunFile("report.html", "report")

@@ -26,10 +26,11 @@ from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import by_number, number_of
 from egvs.report import ranking_text, reliability, sections
 from egvs.report.extension_sections import read_sections
-from egvs.report.sensor_text import range_note
-from egvs.results.labels import ScoreLabel, join_names
+from egvs.report.sensor_text import has_losses, range_note
+from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
 from egvs.results.ranking import Pole, RankedSite, Ranking
 from egvs.scenario.model import Scenario
+from egvs.scenario.score_config import NOTICED
 from egvs.traffic.signal_descriptions import format_plan
 
 _FILE_WIDTH = 150
@@ -69,8 +70,10 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     if caveats := sections.describe_caveats(scenario, "ranking", on_road, plans):
         sentences.append(caveats)
     sentences += reliability.describe_reliability(ranked, traffic_summary, scenario.score.ranking_detectors)
+    if note := ranking_text.lossless_note(ranked, scenario):
+        sentences.append(note)
     sensors = [site.sensor for site in ranked.sites]
-    if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
+    if note := range_note(sensors, is_modelled=has_losses(scenario, sensors)):
         sentences.append(note)
     print_sentences(sentences)
     if ranked.best[0].score > 0 and len(set(sensors)) == 1:
@@ -106,7 +109,8 @@ def _print_ranking(
     out: Console, folder: Path, ranked: Ranking, scenario: Scenario, record: RunRecord, poles: int | None
 ) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
-    print_sentences([verdict(ranked, ranking_text.recorded_frames_hint(scenario, ranked, record.stages))])
+    hint = ranking_text.recorded_frames_hint(scenario, ranked, record.stages)
+    print_sentences([verdict(ranked, hint, scenario.score.ranking_detectors)])
     for part in read_sections(RunFolder(folder), scenario, record.stages):
         for warning in part.warnings:
             print_sentences([f"{warning.sentence} See {RunFolder(folder).report}#{part.section.name}"])
@@ -128,11 +132,16 @@ def _print_ranking(
             print_sentences([in_zones])
     if other_order := order_by_egvs(ranked, parquet.read_metadata(RunFolder(folder).scores, "scores")):
         print_sentences([other_order])
+    if preference := ranking_text.noticed_preference(ranked):
+        print_sentences([preference])
 
 
-def verdict(ranked: Ranking, hint: str = "") -> str:
-    """Return a few sentences: the best site, how clearly it leads and, if unclear, the ``hint`` on what helps."""
-    sentences = [f"{ranking_text.headline(ranked, has_traffic=True)}."]
+def verdict(ranked: Ranking, hint: str = "", detectors: Sequence[str] = ()) -> str:
+    """Return a few sentences: the best site, how clearly it leads and, if unclear, the ``hint`` on what helps.
+
+    ``detectors`` are those of the score that ranks.
+    """
+    sentences = [f"{ranking_text.headline(ranked, has_traffic=True, detectors=detectors)}."]
     if lead := ranking_text.lead(ranked, hint):
         sentences.append(lead)
     return " ".join(sentences)
@@ -168,6 +177,8 @@ def poles_table(ranked: Ranking, by_period: PeriodRanking | None, count: int | N
     ]
     if ranked.has_errors:
         columns.append(Column("std error", lambda pole: ranked.by.error(pole.best.score, pole.best.score_se)))
+    if ranked.has_noticed:
+        columns.append(Column(SCORE_LABELS[NOTICED].head, lambda pole: pole.best.noticed_cell))
     if ranked.companion_score is not None:
         columns.append(_companion_column(ranked.companion_score))
     if by_period is not None and len(by_period.periods) <= _MAX_PERIODS:

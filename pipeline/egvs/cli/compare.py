@@ -67,7 +67,7 @@ def compare(
             "--set",
             metavar="KEY=VALUE",
             help="Override a cost, e.g. 'costs.sensor={\"VLP-32C\"=8000}'; with --sensors, also any key of the "
-            "scenario, for all runs, e.g. effects.range_limit={} (repeatable).",
+            "scenario, for all runs, e.g. effects.range_limit=false (repeatable).",
         ),
     ] = None,
     tpog: Annotated[

@@ -173,12 +173,13 @@ def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
         f"Found where all point clouds are fused before detection: {', '.join(values)} (the last one adds {last} "
         f"{by.change_unit})"
     )
+    noticed = f" People would notice {fused.noticed.text} of vehicles there." if fused.noticed is not None else ""
     if fused.better is not None:
         gain = by.change(fused.better.gain, fused.better.gain_se)
-        return f"{text}; {', '.join(fused.better_sites)} should find {gain} {by.change_unit} more there."
+        return f"{text}; {', '.join(fused.better_sites)} should find {gain} {by.change_unit} more there.{noticed}"
     if fused.searched:
-        return f"{text}; swapping a single sensor finds no more there."
-    return f"{text}."
+        return f"{text}; swapping a single sensor finds no more there.{noticed}"
+    return f"{text}.{noticed}"
 
 
 def _sensor_table(placed: SensorPlan, width: int) -> Table:

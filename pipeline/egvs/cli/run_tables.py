@@ -13,6 +13,7 @@ from rich.table import Table
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, PeriodRank, PeriodRanking
+from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.cli.console import (
     NARROW,
@@ -28,9 +29,10 @@ from egvs.core.errors import collect_warnings
 from egvs.core.wording import format_percent
 from egvs.report import sections
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability
+from egvs.results.levels import GROUPS_NOTE, GroupLevel, read_levels
 from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pole
-from egvs.scenario.effects_config import RangeLimitParameters
-from egvs.scenario.score_config import ALL_DETECTORS
+from egvs.scenario.score_config import ALL_DETECTORS, DEFAULT_SCORE, NOTICED
+from egvs.sensors.return_model import NEGLIGIBLE_LOSS, ReturnModel
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 
 _RESULT_FILE_WIDTH = 150
 _LIST_FILE_WIDTH = 160
-DARK_REFLECTIVITY = RangeLimitParameters().reflectivity
+DARK_REFLECTIVITY = 0.1
 """Reflectivity of dark vehicles, the default of the effect ``range_limit``."""
 _EXTRA_COLUMNS_WIDTH = 130
 """Terminals at least this wide show the entropy seen and the companion score next to the ranking score."""
@@ -96,6 +98,10 @@ def print_scores(folder: Path, record: RunRecord, top: int | None = None, *, bef
     out.print(ranking_table(sites, out.width, top))
     for line in _outcome_sentences(folder, record, sites):
         out.print(line)
+    best = next(site for site in sites if site.rank == 1)
+    levels = read_levels(RunFolder(folder).levels, best.site)
+    if len(levels) > 1:
+        out.print(levels_table(best.site, levels))
     if top is not None and len(sites) > top:
         out.print(f"... and {len(sites) - top:,} more; omit --top, or see {folder / 'scores.parquet'}")
     if not before_answer and len({site.pole for site in sites}) < len(sites):
@@ -169,6 +175,9 @@ def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | Non
         columns.append(Column("std error", lambda site: by.error(site.score, site.score_se)))
         columns.append(Column("beats next", lambda site: _format_beats_next(site, by_rank[-1])))
     columns.append(Column("of best", partial(_format_share_of_best, best_score)))
+    if sites and all(site.noticed is not None for site in sites):
+        noticed_head = SCORE_LABELS[NOTICED].head
+        columns.append(Column(noticed_head, lambda site: site.noticed_cell, min_width=_EXTRA_COLUMNS_WIDTH))
     if companion is not None:
         columns.append(_score_column(companion))
     if "entropy seen" not in [column.title for column in columns]:
@@ -182,6 +191,17 @@ def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | Non
         chance = f"the probability that it truly scores higher is below {format_percent(DISTINCT_PROBABILITY, 0)}"
         caption = f"~ not separable from the next site: {chance}"
     return make_table(columns, shown, width=width, caption=caption)
+
+
+def levels_table(site: str, levels: Sequence[GroupLevel]) -> Table:
+    """Return what detectors should find and people would notice of each group of road users from a site."""
+    columns: list[Column[GroupLevel]] = [
+        Column(f"from {site}", lambda level: level.road_users, "left"),
+        Column("observations", lambda level: f"{level.observations:,}"),
+        Column(SCORE_LABELS[DEFAULT_SCORE].head, lambda level: level.found_text),
+        Column(SCORE_LABELS[NOTICED].head, lambda level: level.noticed.text),
+    ]
+    return make_table(columns, levels, caption=GROUPS_NOTE)
 
 
 def _ranking_score(sites: Sequence[RankedSite]) -> ScoreLabel:
@@ -320,7 +340,7 @@ def print_sensors(sensors: Iterable[Sensor]) -> None:
             "range: no beam is longer. rated: how far the maker's sensor still detects a target of this reflectivity; "
             f"the last column converts it to {format_percent(DARK_REFLECTIVITY, 0)} (dark vehicles), so "
             "that sensors can be compared. "
-            "Scores use it only with --set effects.range_limit={}.",
+            "Losses of returns follow from it, where they can change a result: docs/effects.md.",
             "The catalogue has no prices, and does not say which sensors are still sold. Set prices with "
             "--set 'costs.sensor={\"NAME\" = PRICE}' or in [costs].",
             "egvs sensors NAME prints sources and assumptions; egvs compare SCENARIO --sensors NAME,NAME compares.",
@@ -352,6 +372,15 @@ def print_sensor_details(sensors: Iterable[Sensor]) -> None:
             f"{sensor.range_sigma_m:g} m",
             f"  source: {sensor.source}",
         ]
+        if sensor.rated_range_m is not None:
+            model = ReturnModel.of(sensor)
+            lines.append(
+                f"  losses of returns from cars: half are lost at {model.limit_m(model.target_reflectivity()):.0f} m, "
+                f"{format_percent(NEGLIGIBLE_LOSS, 0)} at {model.lossless_range_m:.0f} m, and "
+                f"{format_percent(model.dropout, 0)} at any range (reflectivity {model.target_reflectivity():g}, "
+                f"softness {model.softness:g}: fitted on two units); rated range: "
+                f"{sensor.rated_source or 'the scenario'}"
+            )
         if sensor.assumed:
             lines.append(f"  assumed: {sensor.assumed}")
         print_sentences(lines)

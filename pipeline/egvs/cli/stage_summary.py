@@ -110,6 +110,8 @@ def _detail(text: str) -> Sentence:
 def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
     sites, solids, lanes = rest.pop("sites"), summary["solids"], rest.pop("lanes")
     yield Sentence(f"{number_of(sites, 'site')}, {number_of(solids, 'solid')} and {number_of(lanes, 'lane')} checked")
+    for note in rest.pop("losses", ()):
+        yield Sentence(note)
 
 
 def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
@@ -221,6 +223,7 @@ def _score_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[
         yield _detail(f"best: {', '.join(best)}")
     if by.name == "egvs":
         yield _detail(f"upper limit {float(limit):,.0f} bit")
+    rest.pop("losses", None)  # the check has reported it
     if gamma := rest.pop("gamma_auto", None):
         yield _detail(f"gamma {gamma:g} (auto)")
     if errors := rest.pop("standard_errors_from", None):

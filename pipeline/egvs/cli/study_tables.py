@@ -18,7 +18,14 @@ from rich.table import Table
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table, percent_or_dash, print_sentences
 from egvs.core.wording import format_percent, list_first
-from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, range_note
+from egvs.report.sensor_text import (
+    costs_option,
+    describe_evidence,
+    describe_losses,
+    explain_differences,
+    noticed_preference,
+    range_note,
+)
 from egvs.results.labels import SCORE_LABELS, join_names
 from egvs.results.ranking import RankedSite, share_of_limit
 from egvs.results.sensors import (
@@ -28,6 +35,7 @@ from egvs.results.sensors import (
     difference_unit,
     format_difference,
 )
+from egvs.scenario.score_config import NOTICED
 from egvs.scenario.settings import effect_state
 
 if TYPE_CHECKING:
@@ -242,6 +250,8 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
         columns.append(Column("yaw", lambda result: f"{result.mount.site.yaw_deg:.0f}", min_width=NARROW))
         columns.append(Column("pitch", lambda result: f"{result.mount.site.pitch_deg:z.0f}", min_width=NARROW))
     columns.append(Column(by.head, lambda result: format_score(result.mount.site)))
+    if all(result.mount.site.noticed is not None for result in sensors.results):
+        columns.append(Column(SCORE_LABELS[NOTICED].head, lambda result: result.mount.site.noticed_text))
     columns.append(Column(f"difference\nfrom {sensors.baseline_name}", lambda result: result.gain_text))
     if any(result.mount.cost is not None for result in sensors.results):
         columns.append(Column("cost", lambda result: result.cost_text))
@@ -251,15 +261,17 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
         columns.append(Column("… from the best cheaper sensor", lambda result: result.step_cost_text, wrap=True))
     out.print(make_table(columns, sensors.results, width=out.width, title="the best mount of each sensor"))
     print_sentences([explain_differences(sensors)])
+    if preference := noticed_preference(sensors):
+        print_sentences([preference])
     if sensors.unpriced:
         words = command or ["egvs", "compare", *dict.fromkeys(str(run.folder) for run in comparison.runs)]
         option = costs_option(sensors.sensors if not sensors.has_costs else sensors.unpriced)
         hint = f"What one more point costs: {shlex.join(words)} {option}, or [costs] in scenario.toml"
         out.print(hint, soft_wrap=True)  # a command that is broken into lines cannot be copied
-    is_modelled = all(run.has_range_limit for run in comparison.runs)
+    is_modelled = all(run.has_losses for run in comparison.runs)
     if note := range_note(sensors.sensors, is_modelled=is_modelled):
         print_sentences([note])
-    print_sentences([describe_evidence(sensors)])
+    print_sentences([describe_evidence(sensors), describe_losses(has_interval=sensors.has_loss_interval)])
     out.print()
 
 

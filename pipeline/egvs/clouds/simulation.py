@@ -63,10 +63,12 @@ from egvs.clouds.sweeps import LabelledSweep, SiteView, Sweep
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.effects.base import Detect, Echo, Echoes
+from egvs.effects.base import Echo, Echoes
+from egvs.effects.returns import ReturnProbability
 from egvs.formats import meshes
 from egvs.kernels import mesh_casting
 from egvs.scenario.model import Scenario
+from egvs.sensors.return_model import class_of
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor
@@ -451,7 +453,7 @@ class CloudSimulator:
         self._scanner = scanner or Scanner(scene, full_sweep=True)
         assert self._scanner.full_sweep
         self._bodies = bodies or vehicle_meshes(scene.scenario)
-        self._detects = scene.acting(Detect)
+        self._return_probability = ReturnProbability.of(scene, sensor)
         self._echo_effects = scene.acting(Echo)
         self._seed = scene.scenario.seed
 
@@ -500,7 +502,7 @@ class CloudSimulator:
         hits = self.first_hits(frame, drawn)
         returned = (hits.owner >= 0) | self._returned
         rows = np.flatnonzero(returned) if drawn is None else drawn[returned[drawn]]
-        rows = self._drop_lost_returns(rows, hits.range_m, rng)
+        rows = self._drop_lost_returns(rows, hits, frame, rng)
         sigma_m: float | FloatArray = self.view.sensor.range_sigma_m
         if self._echo_effects:
             echoes = self._echoes(rows, hits, frame)
@@ -545,13 +547,21 @@ class CloudSimulator:
         drawn: IntArray = rows[self._beam[rows] == beams[inside]]
         return drawn
 
-    def _drop_lost_returns(self, rows: IntArray, range_m: FloatArray, rng: np.random.Generator) -> IntArray:
+    def _drop_lost_returns(
+        self, rows: IntArray, hits: FirstHits, frame: TrafficFrame, rng: np.random.Generator
+    ) -> IntArray:
         """Return the rows whose return is detected, drawn by the probability that effects give it."""
-        if not self._detects:
+        if self._return_probability is None:
             return rows
-        probability = np.ones(len(rows))
-        for effect in self._detects:
-            probability *= effect.detect(range_m[rows], self.view.sensor)
+        owner, triangle = hits.owner[rows], hits.triangle[rows]
+        on_body = owner >= 0
+        reflectivity: FloatArray = hits.intensity[rows].astype(np.float64)  # of the static world, times the cosine
+        classes = [class_of(vclass) for vclass in frame.kinds]
+        body = np.array([road_users.body_reflectivity for road_users in classes])
+        glass = np.array([road_users.glass_reflectivity for road_users in classes])
+        is_glass = self._bodies.surfaces[triangle[on_body]] == "glass"
+        reflectivity[on_body] = np.where(is_glass, glass[owner[on_body]], body[owner[on_body]])
+        probability = self._return_probability(hits.range_m[rows], reflectivity)
         return rows[rng.random(len(rows)) < probability]
 
     def _empty_range_m(self, scan: EmptyScan, beams: int) -> FloatArray:

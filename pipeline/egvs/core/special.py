@@ -41,3 +41,10 @@ def stdtrit(freedom: Any, probability: Any) -> Any:
     from scipy import special
 
     return special.stdtrit(freedom, probability)
+
+
+def ndtr(x: Any) -> Any:
+    """Return the normal distribution function."""
+    from scipy import special
+
+    return special.ndtr(x)

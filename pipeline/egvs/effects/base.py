@@ -124,6 +124,11 @@ class Effect(Generic[P]):
         return ""
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """What the result depends on, for the cache key of a stage: the parameters."""
+        return self.parameters.model_dump(mode="json")
+
+    @property
     def reads(self) -> tuple[str, ...]:
         """Artefacts that the effect reads in addition to those of its stage."""
         return ()
@@ -192,15 +197,21 @@ class Detect(Effect[P]):
 
     STAGE: ClassVar[str] = "score"
     KIND: ClassVar[str] = "detect"
+    THINS_SPANS: ClassVar[bool] = False
+    """Whether the span of the points on a vehicle is that of the returns which are left, in expectation."""
 
     def refusal(self, scene: Scene) -> InputError | None:
         """Return the error for a sensor that lacks a value which the effect needs."""
         try:
-            for sensor in scene.used_sensors.values():
+            for sensor in filter(self.acts_on, scene.used_sensors.values()):
                 self.detect(np.ones(1), sensor)
         except InputError as error:
             return error
         return None
+
+    def acts_on(self, sensor: Sensor) -> bool:
+        """Return whether the effect loses returns of a sensor."""
+        return True
 
     def detection_shares(self, scene: Scene) -> tuple[float, float]:
         """Return the mean detection probability over the region of interest, at its worst and its best site."""
@@ -211,7 +222,8 @@ class Detect(Effect[P]):
         shares = []
         for site in scene.sites:
             range_m = np.sqrt(((points - site.pose.position_m) ** 2).sum(axis=1))
-            shares.append(self.detect(range_m, scene.sensor(site.sensor)).mean())
+            sensor = scene.sensor(site.sensor)
+            shares.append(self.detect(range_m, sensor).mean() if self.acts_on(sensor) else 1.0)
         return float(min(shares)), float(max(shares))
 
     def summary(self, scene: Scene) -> str:
@@ -226,6 +238,10 @@ class Detect(Effect[P]):
         It is not called for each beam and voxel, see :mod:`egvs.scoring.visibility`.
         """
         raise NotImplementedError
+
+    def detect_surface(self, range_m: FloatArray, sensor: Sensor, reflectivity: FloatArray | None) -> FloatArray:
+        """Return the detection probability as :meth:`detect`, of targets of known reflectivity (n,), if it matters."""
+        return self.detect(range_m, sensor)
 
 
 class Echo(Effect[P]):

@@ -28,6 +28,9 @@ _BASE_CLASSES = (base.Expand, base.TransmitScan, base.TransmitScore, base.Detect
 AUTO_ENABLED: dict[str, Callable[[Scenario], bool]] = {"slope": sumo_folder.may_have_slopes}
 """Effects that are enabled automatically, each with a quick test of whether it may act."""
 
+LOSSES = "range_limit"
+"""The effect that is enabled automatically for the sensors that need it, see :mod:`egvs.sensors.return_model`."""
+
 
 def effect_names() -> list[str]:
     """Return all installed effects: built-in ones in the order in which they are applied, then others."""
@@ -79,6 +82,13 @@ def scenario_effects(scenario: Scenario, *stages: str) -> tuple[base.Effect[Any]
     return tuple(effect for effect in effects if effect.STAGE in stages)
 
 
+def make_losses(sensors: Iterable[str] | None) -> base.Effect[Any]:
+    """Return the losses of some sensors, by name, or for None of all with a rated range, with the sensors' values."""
+    effect_class = load_effect_class(LOSSES)
+    names = None if sensors is None else frozenset(sensors)
+    return effect_class(effect_class.Model(), names, True)  # type: ignore[call-arg]
+
+
 def effect_modules(effects: Iterable[base.Effect[Any]]) -> tuple[str, ...]:
     """Return the modules of effects; the results of a stage depend on their source."""
     return tuple(type(effect).__module__ for effect in effects)
@@ -86,7 +96,7 @@ def effect_modules(effects: Iterable[base.Effect[Any]]) -> tuple[str, ...]:
 
 def effect_settings(effects: Iterable[base.Effect[Any]]) -> dict[str, Any]:
     """Return the parameters of effects by name, for the cache key of a stage."""
-    return {effect.NAME: effect.parameters.model_dump(mode="json") for effect in effects}
+    return {effect.NAME: effect.settings for effect in effects}
 
 
 def active_traffic_effects(scenario: Scenario) -> tuple[tuple[base.Traffic[Any], ...], tuple[str, ...]]:

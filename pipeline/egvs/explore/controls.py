@@ -19,7 +19,7 @@ from egvs.explore.session import MovingPlan, PoseScore, Session
 from egvs.explore.settings import Settings
 from egvs.explore.view_state import LAYERS, View
 from egvs.results.labels import SCORE_LABELS
-from egvs.scenario.score_config import OtherScore
+from egvs.scenario.score_config import NOTICED, RankingScore
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site
 
@@ -274,7 +274,8 @@ class Controls:
 
     def _add_settings(self, effects: Mapping[str, str]) -> None:
         gui, session = self._gui, self._session
-        scores = dict.fromkeys((*_FIRST_SCORES, *session.scenario.score.additional, *get_args(OtherScore)))
+        names = (*_FIRST_SCORES, *session.scenario.score.additional, *get_args(RankingScore))
+        scores = dict.fromkeys(name for name in names if name != NOTICED)
         self.score = gui.add_dropdown("score", tuple(scores), hint="Candidates are ranked by this score.")
         self.gamma = gui.add_number(
             "gamma", 0.0, min=0.0, step=0.1, hint="Beams beyond this number in a voxel do not count."

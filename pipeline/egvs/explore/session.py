@@ -11,6 +11,7 @@ Nothing here depends on a page or a browser. World frame, metres.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -32,6 +33,9 @@ from egvs.clouds import simulation as cloud_simulation
 from egvs.clouds.simulation import CloudSimulator, VehicleMeshes, sweep_rng
 from egvs.core.errors import Diagnostic, InputError, choose_one
 from egvs.core.grid import Grid
+from egvs.effects import registry
+from egvs.effects.base import Effect
+from egvs.effects.returns import ReturnProbability
 from egvs.placement import problem_builder
 from egvs.placement.refinement import PlanPoses
 from egvs.results.labels import SCORE_LABELS
@@ -44,7 +48,7 @@ from egvs.scoring.egvs import EntropyField
 from egvs.scoring.points_map import PointsMap, TargetPositions
 from egvs.scoring.scorer import PeriodTpog, Scorer
 from egvs.scoring.target_scores import TARGET_SCORES
-from egvs.scoring.targets import SEEN_WELL_POINTS, detection_probability, visible_targets
+from egvs.scoring.targets import SEEN_WELL_POINTS, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
@@ -240,7 +244,7 @@ class Session:
     candidates
         Scores of all candidates by name.
     engines
-        Cached scanners and scorers, by the names of the active effects.
+        Cached scanners and scorers, by the settings of the active effects.
     """
 
     def __init__(
@@ -257,7 +261,7 @@ class Session:
         self.tpog: Tpog = read_tpog(work.folder.tpog, period or None)
         self._recorded = recorded or _RecordedVehicles(work, self.tpog.grid)
         self.candidates: dict[str, PoseScore] = self._read_candidates()
-        self.engines: dict[tuple[str, ...], Engine] = {}
+        self.engines: dict[str, Engine] = {}
 
     def in_period(self, period: str) -> Session:
         """Return the same run in one period, or in all periods for an empty name."""
@@ -367,7 +371,7 @@ class Session:
         targets = self._recorded.spot_scorer
         assert targets.spots is not None
         beams = self.beams(site)
-        probability = detection_probability(self.scene_with(site), beams.sensor)
+        probability = ReturnProbability.of(self.scene_with(site), beams.sensor)
         visible = visible_targets(targets.record, beams, probability)
         visibility = targets.spots.visibility(visible.points, TARGET_SCORES[DEFAULT_SCORE](visible, targets.detectors))
         return site_blindspots(site.name, targets.spots, visibility, self.tpog.grid)
@@ -390,7 +394,7 @@ class Session:
         for place in self._recorded.positions:
             if place.target.name == target:
                 beams = self.beams(site)
-                return place.points_map(beams, detection_probability(self.scene_with(site), beams.sensor))
+                return place.points_map(beams, ReturnProbability.of(self.scene_with(site), beams.sensor))
         return None
 
     def scene_with(self, site: Site) -> Scene:
@@ -439,7 +443,7 @@ class Session:
         """Return scanner and scorer with the effects that act when a candidate is moved to ``site``."""
         sites = tuple(site if other.name == site.name else other for other in self.scene.sites)
         scene = scene_inputs.with_effects(replace(self.scene, sites=sites, effects=(), inactive_effects=()))
-        key = tuple(effect.NAME for effect in scene.effects)
+        key = json.dumps(registry.effect_settings(scene.acting(Effect)))
         if key not in self.engines:
             scene = replace(scene, sites=())  # one scanner for all poses
             self.engines[key] = Engine(scene, Scanner(scene, mounts=1), self._make_scorer(scene))
@@ -473,11 +477,12 @@ class Session:
         scores |= {name: float(values[0]) for name, values in result.shares.items()}
         if self._targets is None:
             return scores
-        visible = visible_targets(self._targets.record, beams, detection_probability(engine.scene, beams.sensor))
+        visible = visible_targets(self._targets.record, beams, ReturnProbability.of(engine.scene, beams.sensor))
         target_scores = self._targets.scores(visible)
         if self.period:
             return {**scores, **target_scores.by_period[self.periods.index(self.period)]}
-        return scores | {name: float(values[0]) for name, values in target_scores.scores.items()}
+        of_vehicles = target_scores.scores
+        return scores | {name: float(of_vehicles[name][0]) for name in of_vehicles if name in TARGET_SCORES}
 
 
 def site_blindspots(site: str, spots: VehicleSpots, visibility: SpotVisibility, grid: Grid) -> SiteBlindspots:

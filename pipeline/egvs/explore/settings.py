@@ -76,7 +76,9 @@ class Settings:
             values["score"]["gamma"] = "inf" if math.isinf(self.gamma) else self.gamma
         values["score"]["rank_by"] = self.rank_by
         named = values["effects"]
-        values["effects"] = {name: named.get(name, trial_parameters(name)) for name in sorted(self.effects)}
+        values["effects"] = {name: named.get(name) or trial_parameters(name) for name in sorted(self.effects)}
+        if registry.LOSSES not in self.effects and scenario.effects.range_limit is not None:
+            values["effects"][registry.LOSSES] = False  # without it, losses would act by themselves
         return scenario_from_dict(values, scenario.folder, where or str(scenario.file))
 
     def overrides(self, scenario: Scenario) -> tuple[str, ...]:
@@ -91,7 +93,7 @@ class Settings:
             parameters = ", ".join(f"{key}={value}" for key, value in trial_parameters(name).items())
             overrides.append(f"effects.{name}={{{parameters}}}")
         for name in sorted(unchanged.effects - self.effects):
-            overrides.append(f"without effects.{name}")
+            overrides.append("effects.range_limit=false" if name == registry.LOSSES else f"without effects.{name}")
         return tuple(overrides)
 
 
@@ -105,7 +107,8 @@ def offered_effects(session: Session) -> dict[str, str]:
     named = session.scenario.effects.named
     offered = {}
     for status in effect_study.effect_statuses_in_scene(session.scene):
-        if status.state not in _OFFERED_STATES:
+        acts_by_itself = status.name == registry.LOSSES and status.name not in named
+        if status.state not in _OFFERED_STATES or acts_by_itself:
             continue
         if status.name in named or not registry.load_effect_class(status.name).USER_KNOWLEDGE:
             offered[status.name] = status.why

@@ -46,6 +46,24 @@ _STEEPEST = 1e308
 SLICES = 64
 """Slices of a vehicle's length, to find the longest stretch without points."""
 
+NEGLIGIBLE_CHANCE = 1e-3
+"""Gaps that are rarer than this are not added up."""
+
+MANY_POINTS = 128.0
+"""From this expected number of points on a vehicle, their extent is that of all beams which meet it."""
+
+_SHARE_UNIT = 2.0**30
+"""Shares of returns are added in integer multiples of 1 / ``_SHARE_UNIT``."""
+
+MANY_SLICES = 12.0
+"""From this expected number of slices with points, the gaps after each of them are taken as independent."""
+
+SHARE_TOLERANCE = 1e-3
+"""Largest difference between a share of returns and its parabola over a vehicle."""
+
+MAX_STEP_CHANGE = 1.0
+"""Chances of gaps are interpolated over steps with at most this number of slices times the change of the chance."""
+
 _ON_SIDE_M = 1e-6
 """A beam that ends within this distance of the plane of a side meets the side, not the roof."""
 
@@ -334,6 +352,120 @@ def _add_box_hits(b, box, directions, rows, nearest_m, weight, sums):  # type: i
     low[b, 0], high[b, 0], low[b, 1], high[b, 1] = a_low, a_high, b_low, b_high
 
 
+@_inlined
+def _share_at(by_range, steps):  # type: ignore[no-untyped-def]
+    """The share of returns that are detected, interpolated between the steps of range."""
+    step = min(np.int64(steps), by_range.shape[0] - 2)
+    return by_range[step] + min(steps - step, 1.0) * (by_range[step + 1] - by_range[step])
+
+
+@_kernel
+def _parabola(by_range, near, far):  # type: ignore[no-untyped-def]
+    """The parabola through the share at the ends and the middle of some steps of range, as c0 + c1 u + c2 u^2.
+
+    u is the number of steps from the middle. Returns also the largest difference at two points between.
+    """
+    middle, half = 0.5 * (near + far), max(0.5 * (far - near), 1e-9)
+    at_near, at_middle, at_far = _share_at(by_range, near), _share_at(by_range, middle), _share_at(by_range, far)
+    slope, bend = 0.5 * (at_far - at_near) / half, 0.5 * (at_far + at_near - 2.0 * at_middle) / (half * half)
+    u = 0.5 * half
+    below = abs(at_middle - slope * u + bend * u * u - _share_at(by_range, middle - u))
+    above = abs(at_middle + slope * u + bend * u * u - _share_at(by_range, middle + u))
+    return at_middle, slope, bend, max(below, above)
+
+
+@_kernel
+def _box_parabola(box, by_range, per_m):  # type: ignore[no-untyped-def]
+    """Coefficients of the share of returns over a box, the step of range that they count from, and their error."""
+    away = math.sqrt(box[3] * box[3] + box[8] * box[8] + box[13] * box[13]) * per_m
+    reach = math.sqrt(box[4] * box[4] + box[9] * box[9] + box[14] * box[14]) * per_m
+    near, far = max(away - reach, 0.0), away + reach
+    c0, c1, c2, error = _parabola(by_range, near, far)
+    return (c0, c1, c2, 0.5 * (near + far)), error
+
+
+@_kernel
+def _weigh_box_hits(b, box, directions, runs, nearest_m, t_m, parabola, per_m, sums):  # type: ignore[no-untyped-def]
+    """Fill the sums of :func:`first_hits` for box b, where each beam counts the share of its return that is detected.
+
+    The share is a ``parabola`` of :func:`_box_parabola`.
+    """
+    c0, c1, c2, middle = parabola
+    ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
+    bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
+    units, side_units, parts, done = np.int64(0), np.int64(0), np.uint64(0), 0  # sums of integers are vectorised
+    a_low, a_high, b_low, b_high = _LARGEST_KEY, -_LARGEST_KEY, _LARGEST_KEY, -_LARGEST_KEY
+    for r in range(runs.shape[0]):
+        first, last = runs[r, 0], runs[r, 1]
+        x, y, z = directions[0, first:last], directions[1, first:last], directions[2, first:last]
+        nearest, run_t_m = nearest_m[first:last], t_m[done : done + last - first]
+        for n in range(last - first):
+            ends_here, t = run_t_m[n] == nearest[n], run_t_m[n]
+            along = ao + t * (ax * x[n] + ay * y[n] + az * z[n])
+            across = bo + t * (bx * x[n] + by * y[n] + bz * z[n])
+            steps = (t if ends_here else 0.0) * per_m - middle
+            share = np.int32(_SHARE_UNIT * min(max(c0 + steps * (c1 + steps * c2), 0.0), 1.0))
+            units += share if ends_here else np.int32(0)
+            side_units += share if ends_here & _is_on_side(along, across, ah, bh) else np.int32(0)
+            parts |= (np.uint64(1) if ends_here else np.uint64(0)) << _slice_of(along, ah)
+            u, v = _order_key(along), _order_key(across)
+            a_low, a_high = min(a_low, u if ends_here else _LARGEST_KEY), max(a_high, u if ends_here else -_LARGEST_KEY)
+            b_low, b_high = min(b_low, v if ends_here else _LARGEST_KEY), max(b_high, v if ends_here else -_LARGEST_KEY)
+        done += last - first
+    total, sides, slices, low, high = sums
+    if parts != np.uint64(0):
+        total[b], sides[b], slices[b] = units / _SHARE_UNIT, side_units / _SHARE_UNIT, parts
+        low[b, 0], high[b, 0] = _key_value(a_low), _key_value(a_high)
+        low[b, 1], high[b, 1] = _key_value(b_low), _key_value(b_high)
+
+
+@_kernel
+def _miss_slices(box, directions, rows, nearest_m, parabola, per_m, misses):  # type: ignore[no-untyped-def]
+    """Multiply the misses (2, SLICES) of a box by the probability that the returns of the beams ``rows`` are lost."""
+    c0, c1, c2, middle = parabola
+    ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
+    bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
+    x, y, z = directions[0], directions[1], directions[2]
+    by_length, by_width = misses[0], misses[1]
+    for n in rows:
+        t = nearest_m[n]
+        steps = t * per_m - middle
+        miss = np.float32(1.0 - min(max(c0 + steps * (c1 + steps * c2), 0.0), 1.0))
+        by_length[_slice_of(ao + t * (ax * x[n] + ay * y[n] + az * z[n]), ah)] *= miss
+        by_width[_slice_of(bo + t * (bx * x[n] + by * y[n] + bz * z[n]), bh)] *= miss
+
+
+@_kernel
+def _thin_box_hits(b, box, directions, rows, nearest_m, weight, loss, sums):  # type: ignore[no-untyped-def]
+    """Fill the sums of :func:`first_hits` and the misses for box b, on which the beams ``rows`` end."""
+    shares, share_row, per_m, miss_row, misses = loss
+    ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
+    bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
+    x, y, z = directions[0], directions[1], directions[2]
+    total, sides, slices, low, high = sums
+    by_range, is_weighted = shares[share_row[b]], weight.shape[0] > 0
+    by_length, by_width = misses[miss_row[b], 0], misses[miss_row[b], 1]
+    hit_weight, on_sides, parts = 0.0, 0.0, np.uint64(0)
+    a_low, a_high, b_low, b_high = np.inf, -np.inf, np.inf, -np.inf
+    for n in rows:
+        share = _share_at(by_range, nearest_m[n] * per_m)
+        if is_weighted:
+            share *= weight[n]
+        if share > 0.0:
+            along = ao + nearest_m[n] * (ax * x[n] + ay * y[n] + az * z[n])
+            across = bo + nearest_m[n] * (bx * x[n] + by * y[n] + bz * z[n])
+            hit_weight += share
+            on_sides += share if _is_on_side(along, across, ah, bh) else 0.0
+            part = _slice_of(along, ah)
+            parts |= np.uint64(1) << part
+            by_length[part] *= 1.0 - share
+            by_width[_slice_of(across, bh)] *= 1.0 - share
+            a_low, a_high = min(a_low, along), max(a_high, along)
+            b_low, b_high = min(b_low, across), max(b_high, across)
+    total[b], sides[b], slices[b] = hit_weight, on_sides, parts
+    low[b, 0], high[b, 0], low[b, 1], high[b, 1] = a_low, a_high, b_low, b_high
+
+
 @_kernel
 def _list_box_hits(b, box, directions, rows, nearest_m, hits, count):  # type: ignore[no-untyped-def]
     """List the hits of the beams ``rows`` on box b of all frames after ``count``; returns the new number."""
@@ -379,7 +511,7 @@ def _reset(runs, length_m, nearest_m):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: ignore[no-untyped-def]
+def first_hits(begin, o, size_m, boxes, beams, nearest_m, loss, sums, hits):  # type: ignore[no-untyped-def]
     """Add up, or list, the beams that meet each box first: of all frames, or as many as fit in the list.
 
     Parameters
@@ -399,6 +531,13 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: 
         listed only where there are weights.
     nearest_m
         Scratch, (m,) float64: the length of each beam, before and after the call.
+    loss
+        Losses of returns, where beams are added up: ``shares``, the share of returns that are detected at equidistant
+        ranges from 0, interpolated between them, a row for each reflectivity, (k, m) float64, m > 1; no row where all
+        are detected. ``share_row``: the row of each box, (b,) int64. ``per_m``: steps in a metre. ``miss_row``: the row
+        of ``misses`` of each box, (b,) int64; filled with -1 for boxes with :data:`MANY_POINTS` expected points, whose
+        extent is that of all beams. ``misses``, 1 at first, is multiplied by the probability that no return is from a
+        slice: of the length, and of the width, (n, 2, SLICES) float32.
     sums
         Filled: ``alone``, (b,) float64, the weight of all beams that meet the box, occluded or not; 0 at first. And,
         for ``listed`` boxes, unless ``hits`` are listed, of the beams that meet it first: ``total``, (b,) float64,
@@ -450,11 +589,27 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: 
             alone[box[k]] = met if weight.shape[0] == 0 else _met_weight(box_runs, box_t_m, weight)
         for k in range(oriented):
             b, box_runs, box_t_m = box[k], runs[k, : filled[k]], t_m[offset[k] :]
-            if listed[b] and weight.shape[0] == 0:
+            if listed[b] and weight.shape[0] == 0 and loss[0].shape[0] == 0:
                 _count_box_hits(b, facing[k], directions, box_runs, nearest_m, box_t_m, added)
             elif listed[b]:
-                box_rows = rows[: _list_rows(box_runs, nearest_m, box_t_m, rows)]
-                if room > 0:
+                has_losses, is_smooth, parabola = loss[0].shape[0] > 0, False, (0.0, 0.0, 0.0, 0.0)
+                if has_losses and weight.shape[0] == 0:
+                    parabola, error = _box_parabola(facing[k], loss[0][loss[1][b]], loss[2])
+                    is_smooth = error <= SHARE_TOLERANCE
+                if is_smooth:
+                    _weigh_box_hits(b, facing[k], directions, box_runs, nearest_m, box_t_m, parabola, loss[2], added)
+                is_certain = is_smooth and (added[0][b] >= MANY_POINTS or added[2][b] == np.uint64(0))
+                box_rows = rows[:0]
+                if not is_certain:
+                    box_rows = rows[: _list_rows(box_runs, nearest_m, box_t_m, rows)]
+                if is_certain:
+                    loss[3][b] = -1
+                elif is_smooth:
+                    box_misses = loss[4][loss[3][b]]
+                    _miss_slices(facing[k], directions, box_rows, nearest_m, parabola, loss[2], box_misses)
+                elif has_losses:
+                    _thin_box_hits(b, facing[k], directions, box_rows, nearest_m, weight, loss, added)
+                elif room > 0:
                     count = _list_box_hits(b, facing[k], directions, box_rows, nearest_m, hits, count)
                 else:
                     _add_box_hits(b, facing[k], directions, box_rows, nearest_m, weight, added)
@@ -500,6 +655,134 @@ def longest_slice_gaps(slices, share):  # type: ignore[no-untyped-def]
                     longest = max(longest, part - last - 1)
                 last = part
         share[i] = longest / SLICES
+
+
+@_kernel
+def expected_spans(misses, rows, bounds_m, sizes_m, spans):  # type: ignore[no-untyped-def]
+    """Fill the expected distance between the outermost points, as a share of each vehicle's length and width.
+
+    A point in a slice counts at its outer end, but not beyond ``bounds_m``. Points are lost independently.
+
+    Parameters
+    ----------
+    misses
+        Probability that a slice has no point: of the length, and of the width, (n, 2, SLICES) float32.
+    rows
+        Vehicles to fill, (k,) int64.
+    bounds_m
+        Lowest and highest coordinate of any point that may be detected, (n, 2, 2) float64.
+    sizes_m
+        Length and width, (n, 2) float64.
+    spans
+        Filled: shares, (n, 2) float64; 0 for a vehicle without points.
+    """
+    for i in rows:
+        for axis in range(2):
+            low, high = bounds_m[i, 0, axis], bounds_m[i, 1, axis]
+            if not high > low:
+                spans[i, axis] = 0.0
+                continue
+            size, empty_below, empty_above, span = sizes_m[i, axis], 1.0, 1.0, 0.0
+            for part in range(SLICES):
+                below, above = misses[i, axis, part], misses[i, axis, SLICES - 1 - part]
+                if below < 1.0:  # the lowest point is in this slice
+                    span -= empty_below * (1.0 - below) * max(low, size * (part / SLICES - 0.5))
+                    empty_below *= below
+                if above < 1.0:
+                    span += empty_above * (1.0 - above) * min(high, size * (0.5 - part / SLICES))
+                    empty_above *= above
+            spans[i, axis] = min(max(span / size, 0.0), 1.0)
+
+
+@_kernel
+def _chance_of_gap(miss, part, count, gap, ends):  # type: ignore[no-untyped-def]
+    """Probability that ``gap`` or more slices without points lie between two slices with points.
+
+    All gaps are shorter with the probability of the sum over s of f(s) times that no point follows slice s, plus that
+    no slice has a point, where f(s) is the probability that s has a point and all gaps before it are shorter.
+
+    Parameters
+    ----------
+    miss, part
+        Probability that a slice has no point, below 1, and the number of this slice, ascending; (m,) float64 and int64.
+    count
+        Number of slices, at most m.
+    gap
+        Number of slices without points, at least 1.
+    ends
+        Scratch, (m,) float64: f.
+    """
+    none_before = 1.0
+    for s in range(count):
+        reached, empty, before = none_before, 1.0, s - 1
+        while before >= 0 and part[s] - part[before] <= gap and empty > NEGLIGIBLE_CHANCE:
+            reached += ends[before] * empty
+            empty *= miss[before]
+            before -= 1
+        ends[s] = reached * (1.0 - miss[s])
+        none_before *= miss[s]
+    shorter, none_after = none_before, 1.0
+    for s in range(count - 1, -1, -1):
+        shorter += ends[s] * none_after
+        none_after *= miss[s]
+    return max(1.0 - shorter, 0.0)
+
+
+@_kernel
+def _mean_gap_of_many(miss, part, count, none):  # type: ignore[no-untyped-def]
+    """Expected longest gap between many slices with points, where the gaps after each of them are nearly independent.
+
+    ``none``: scratch, (SLICES + 1,) float64: the probability that no gap is as long. Other parameters are as for
+    :func:`_chance_of_gap`.
+    """
+    none[:] = 1.0
+    longest = 0
+    for s in range(count - 1):
+        run, next_slice, gap = 1.0 - miss[s], s + 1, 1  # that s has a point, and no slice after it so far
+        while next_slice < count - 1 or part[s] + gap < part[count - 1]:
+            if part[s] + gap == part[next_slice]:
+                run *= miss[next_slice]
+                next_slice += 1
+            if run < NEGLIGIBLE_CHANCE:
+                break
+            none[gap] *= 1.0 - run
+            gap += 1
+        longest = max(longest, gap - 1)
+    mean = 0.0
+    for gap in range(1, longest + 1):
+        mean += 1.0 - none[gap]
+    return mean
+
+
+@_kernel
+def expected_gaps(misses, rows, share):  # type: ignore[no-untyped-def]
+    """Fill the expected longest stretch between two slices with points, as a share of the length, (n,) float64.
+
+    ``misses`` and ``rows`` are as for :func:`expected_spans`; other vehicles are not filled.
+    """
+    miss, part, ends, none = np.empty(SLICES), np.empty(SLICES, np.int64), np.empty(SLICES), np.empty(SLICES + 1)
+    for i in rows:
+        count, occupied = 0, 0.0
+        for s in range(SLICES):
+            if misses[i, 0, s] < 1.0:
+                miss[count], part[count] = misses[i, 0, s], s
+                occupied += 1.0 - miss[count]
+                count += 1
+        if occupied >= MANY_SLICES:
+            share[i] = _mean_gap_of_many(miss, part, count, none) / SLICES
+            continue
+        total, gap, chance = 0.0, 0, 1.0  # sums the chances of gaps 1, 2, ...; longer ones are rarer
+        most = part[count - 1] - part[0] - 1 if count > 1 else 0
+        step = 4
+        while gap < most and chance > NEGLIGIBLE_CHANCE:
+            step = min(step, most - gap)
+            next_chance = _chance_of_gap(miss, part, count, gap + step, ends)
+            while step > 1 and (chance - next_chance) * step > MAX_STEP_CHANGE:
+                step //= 2
+                next_chance = _chance_of_gap(miss, part, count, gap + step, ends)
+            total += 0.5 * ((step - 1) * chance + (step + 1) * next_chance)  # linear in between
+            gap, chance, step = gap + step, next_chance, 2 * step
+        share[i] = total / SLICES
 
 
 @_kernel

@@ -6,7 +6,9 @@ points of all sensors of a plan S are added on each vehicle-frame i before the m
 
 .. math:: E_f(S) = \frac{\sum_i w_i \, p\big(\mathrm{fuse}_{s \in S}\, x_{i,s}\big)}{\sum_i w_i}
 
-p is the mean over detectors. People, for whom there is no model, are found from 20 points of all sensors on.
+p is the mean over detectors. People, for whom there is no model, are found from 20 points of all sensors on. What
+people would notice in the fused clouds has the same form, with the curves of :mod:`egvs.scoring.noticed`; these were
+measured with single sensors. It is computed for the plan, and chooses nothing.
 
 E_f is neither monotone nor submodular: a further sensor may open a hole between points, or be the one with most
 points although it sees the vehicle less well. So the tangents that bound the joint score of independent sensors do not
@@ -20,6 +22,7 @@ as long as E_f rises. Only the candidates that are tried are scanned. A value ta
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -27,10 +30,12 @@ import numpy as np
 from egvs.core.grid import FloatArray
 from egvs.placement.plan_error import PlanErrors
 from egvs.placement.problem import Plan, Problem
+from egvs.results.levels import NoticedShare
 from egvs.results.plans import FusedPlan, PlanStep
 from egvs.scoring.fused_targets import fuse_targets
+from egvs.scoring.noticed import noticed_bounds, noticed_chances, noticed_errors
 from egvs.scoring.target_scores import expected_by_detector
-from egvs.scoring.targets import VisibleTargets, weighted_mean
+from egvs.scoring.targets import TargetVisibility, VisibleTargets, weighted_mean
 from egvs.scoring.visibility import Beams
 from egvs.stages.site_scoring import TargetScorer
 
@@ -77,9 +82,12 @@ class FusedScore:
         detectors = self.targets.detectors
         if not plan:
             return np.zeros((len(detectors), len(self.targets.record)))
+        return expected_by_detector(self.fused(plan), detectors)
+
+    def fused(self, plan: Sequence[int]) -> TargetVisibility:
+        """Return what the sensors of a plan, at least one, see together."""
         self.prepare(plan)
-        fused = fuse_targets([self._visible[self.names[i]] for i in plan])
-        return expected_by_detector(fused, detectors)
+        return fuse_targets([self._visible[self.names[i]] for i in plan])
 
     def value(self, plan: Sequence[int]) -> float:
         """Return the share of vehicles that a plan is expected to find, 0 to 1."""
@@ -117,14 +125,29 @@ def evaluate_fused_plan(
     """
     plans = [tuple(order[:count]) for count in range(1, len(order) + 1)]
     steps = _steps(score, [(), *plans], errors)
+    noticed = _noticed_share(score, plans[-1], errors)
     if not search:
-        return FusedPlan(steps)
+        return FusedPlan(steps, noticed=noticed)
 
     better = improve_by_fused_swaps(problem, score, plans[-1])
     if set(better) == set(order):
-        return FusedPlan(steps, searched=True)
+        return FusedPlan(steps, searched=True, noticed=noticed)
     (step,) = _steps(score, [plans[-1], better], errors)
-    return FusedPlan(steps, tuple(score.names[i] for i in better), step, searched=True)
+    return FusedPlan(steps, tuple(score.names[i] for i in better), step, searched=True, noticed=noticed)
+
+
+def _noticed_share(score: FusedScore, plan: Plan, errors: PlanErrors) -> NoticedShare:
+    """Return what people would notice in the fused clouds of a plan."""
+    fused, weight = score.fused(plan), score.targets.weight
+    chances = noticed_chances(fused)
+    low, high = (weighted_mean(bound, weight) for bound in noticed_bounds(fused))
+    by_detector = np.tile(chances, (len(score.targets.detectors), 1))  # the same for each: they add no error
+    (traffic,) = errors.of_chances([np.zeros_like(by_detector), by_detector])
+    se = None
+    if not math.isnan(traffic.score_se):
+        of_curves = [weighted_mean(change, weight) for change in noticed_errors(fused)]
+        se = math.hypot(traffic.score_se, *of_curves)
+    return NoticedShare(weighted_mean(chances, weight), se, low, high)
 
 
 def _steps(score: FusedScore, plans: Sequence[Plan], errors: PlanErrors) -> tuple[PlanStep, ...]:

@@ -14,9 +14,10 @@ import numpy as np
 
 from egvs.artefacts import parquet
 from egvs.core.grid import FloatArray
+from egvs.effects.returns import ReturnProbability
 from egvs.results.plans import PlannedSensor
 from egvs.scoring.blindspots import SpotVisibility
-from egvs.scoring.targets import detection_probability, visible_targets
+from egvs.scoring.targets import visible_targets
 from egvs.scoring.zone_results import PLAN_ZONES, ZoneUsers
 from egvs.stages.base import StageContext
 from egvs.stages.plan_scans import plan_beams
@@ -59,7 +60,7 @@ class PlanZones:
         sites = [sensor.mount for sensor in sensors]
         visible = []
         for _, beams in plan_beams(context, sites, moved=moved):
-            visible.append(visible_targets(users.record, beams, detection_probability(scene, beams.sensor)))
+            visible.append(visible_targets(users.record, beams, ReturnProbability.of(scene, beams.sensor)))
         single = [users.visibility(of_sensor).share for of_sensor in visible]
         return cls(users, users.together(visible), np.max(single, axis=0))
 

@@ -26,6 +26,7 @@ from egvs.drawing import maps, pages
 from egvs.drawing import run_figures as figures
 from egvs.drawing.basemap import network_file
 from egvs.drawing.run_figures import Figures
+from egvs.report import sensor_text
 from egvs.report.extension_sections import (
     SectionContents,
     read_sections,
@@ -34,7 +35,14 @@ from egvs.report.extension_sections import (
     section_modules,
 )
 from egvs.report.points_section import MAPPED_POLES, PointsSection
-from egvs.report.ranking_text import entropy_seen_note, headline, lead, recorded_frames_hint
+from egvs.report.ranking_text import (
+    entropy_seen_note,
+    headline,
+    lead,
+    lossless_note,
+    noticed_preference,
+    recorded_frames_hint,
+)
 from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
@@ -47,12 +55,15 @@ from egvs.report.sections import (
     ranking_disagreement,
     study_values,
 )
-from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, range_note
+from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, has_losses, range_note
 from egvs.results import labels as formatting
+from egvs.results.labels import SCORE_LABELS
+from egvs.results.levels import GROUPS_NOTE, GroupLevel, read_levels
 from egvs.results.map_credits import read_map_credits
 from egvs.results.ranking import RankedSite, Ranking, share_of_limit
 from egvs.results.sensors import SensorComparison
 from egvs.scenario.model import Scenario
+from egvs.scenario.score_config import NOTICED
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_dependencies import scan_dependencies
 
@@ -78,6 +89,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 _OPTIONAL_FILES = (
     RunFolder.scores_by_period.name,
+    RunFolder.levels.name,
     RunFolder.blindspots.name,
     RunFolder.zones.name,
     RunFolder.plan_zones.name,
@@ -110,6 +122,8 @@ class PageContents:
         Results of other commands and of periods; None if those commands have not run.
     what_if
         Results of what-ifs; None without any.
+    levels
+        What detectors find and people notice of each group of road users from the best site.
     zones, points
         Road users found in zones, and maps of points on target; None where the scenario has no zones or no lanes.
     movements
@@ -133,6 +147,7 @@ class PageContents:
     movements: Mapping[str, str] = field(default_factory=dict)
     what_if: WhatIfSection | None = None
     zones: ZoneSection | None = None
+    levels: tuple[GroupLevel, ...] = ()
     points: PointsSection | None = None
     approaches: tuple[ApproachFit, ...] = ()
     approach_map: str = ""
@@ -279,6 +294,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         plan=None if plan is None else _plan_values(plan, ranking, tpog, drawn),
         what_if=_read_what_ifs(work, stages, best),
         movements=describe_counts(work.scenario, network),
+        levels=read_levels(work.folder.levels, ranking.sites[0].site),
         zones=_read_zones(work, best, tpog, drawn, has_plan=plan is not None),
         points=PointsSection.draw(work, mapped, mounts, tpog.grid, backdrop, moved=moved),
         approaches=approaches,
@@ -411,12 +427,17 @@ def _ranking_values(ranking: Ranking) -> dict[str, Any]:
         "map_names": maps.describe_names(ranking.sites),
         "limit_share": limit_share,
         "best_name": ranking.sites[0].site,
+        "noticed": SCORE_LABELS[NOTICED] if ranking.has_noticed else None,
+        "groups_note": GROUPS_NOTE,
     }
 
 
 def _setting_values(contents: PageContents) -> dict[str, Any]:
     scenario = contents.scenario
     effects, gamma = list(scenario.effects.named), scenario.gamma
+    modelled = set(effects)
+    if "score" in contents.stages and contents.stages["score"].summary.get("losses"):
+        modelled.add("range_limit")
     frames = contents.tpog.frames
     if contents.by_period is not None:
         frames = contents.by_period.frames
@@ -433,7 +454,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
         "frames": frames,
         "duration": formatting.format_duration(frames * scenario.traffic.frame_period_s),
         "effects": effects,
-        "unmodelled": [name for name, effect in _UNMODELLED if effect not in effects],
+        "unmodelled": [name for name, effect in _UNMODELLED if effect not in modelled],
     }
 
 
@@ -443,9 +464,10 @@ def _sensor_values(contents: PageContents) -> dict[str, Any]:
     names = [site.sensor for site in contents.ranking.sites]
     return {
         "sensors": sensors,
-        "range_note": range_note(names, is_modelled=contents.scenario.effects.range_limit is not None),
+        "range_note": range_note(names, is_modelled=has_losses(contents.scenario, names)),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
         "sensors_explanation": explain_differences(sensors) if sensors is not None else "",
+        "sensors_preference": sensor_text.noticed_preference(sensors) if sensors is not None else "",
         "sensors_evidence": describe_evidence(sensors) if sensors is not None else "",
     }
 
@@ -463,11 +485,14 @@ def _cost_values(stages: Mapping[str, StageRecord]) -> dict[str, Any]:
 
 def _warning_values(contents: PageContents) -> dict[str, Any]:
     warnings = collect_warnings(stage.summary for stage in contents.stages.values())
+    reliability = describe_reliability(
+        contents.ranking, traffic_summary(contents.stages), contents.scenario.score.ranking_detectors
+    )
+    if note := lossless_note(contents.ranking, contents.scenario):
+        reliability.append(note)
     return {
         "warnings": warnings,
-        "reliability": describe_reliability(
-            contents.ranking, traffic_summary(contents.stages), contents.scenario.score.ranking_detectors
-        ),
+        "reliability": reliability,
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 
@@ -478,9 +503,10 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     has_occlusion = "moving_occlusion" in scenario.effects.named
     setting = egvs_setting(scenario.gamma, tpog.grid.voxel_m, moving_occlusion=has_occlusion)
     return {
-        "headline": headline(ranking, bool(tpog.counts.any())),
+        "headline": headline(ranking, bool(tpog.counts.any()), scenario.score.ranking_detectors),
         "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
+        "preference": noticed_preference(ranking),
         "disagreement": ranking_disagreement(ranking.sites, setting, detectors=scenario.score.detectors),
     }
 
@@ -497,6 +523,7 @@ STAGE = Stage(
         RunFolder.scans,
         RunFolder.scores,
         RunFolder.scores_by_period,
+        RunFolder.levels,
         RunFolder.blindspots,
         RunFolder.zones,
     ),

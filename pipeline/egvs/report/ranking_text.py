@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.wording import by_number, format_percent, list_first
 from egvs.results.labels import ScoreLabel, format_probability, join_names
+from egvs.results.levels import MIN_NOTICED_LEAD
 from egvs.results.ranking import CLOSE_SHARE, RankedSite, Ranking
 from egvs.scenario.model import Scenario
+from egvs.scenario.score_config import DEFAULT_SCORE
 
 MIN_RELEVANT_LEAD = 0.001
 """Poles whose scores differ by less are equally good; of shares as it is, of others relative to the best score."""
@@ -17,8 +19,61 @@ _MIN_LEAD = 0.0005
 """Shares that differ by less than this look the same with one decimal."""
 
 
-def headline(ranking: Ranking, has_traffic: bool) -> str:
-    """Return the result in one sentence."""
+def level(site: RankedSite, detectors: Sequence[str]) -> str:
+    """Return what a site achieves: what detectors should find and, beside it, what people would notice.
+
+    Parameters
+    ----------
+    site
+        The site.
+    detectors
+        Detectors that the score that ranks averages over; empty for a score without detectors.
+
+    Returns
+    -------
+    str
+        E.g. "detectors (cluster, pointpillars) should find 84.1 % of vehicles; people would notice 90 ± 2 % in its
+        sweeps". For a score without detectors it begins with a verb: "sees 60.0 % of vehicles well".
+    """
+    text = site.by.sentence(site.score)
+    if not detectors:
+        return text
+    if len(detectors) > 1:
+        text = f"detectors ({', '.join(detectors)}) {text}"
+    else:
+        text = f"the detector {detectors[0]} {text}"
+    if site.noticed is not None:
+        text += f"; people would notice {site.noticed.text} in its sweeps"
+    return text
+
+
+def noticed_preference(ranking: Ranking) -> str:
+    """Return a sentence if people would notice clearly more from another pole than from the best one; else empty."""
+    best = ranking.sites[0]
+    if ranking.by.name != DEFAULT_SCORE or not ranking.has_noticed or ranking.is_tie:
+        return ""
+    shares = {site.site: site.noticed for site in ranking.sites if site.noticed is not None}
+    other = max(ranking.sites, key=lambda site: shares[site.site].value)
+    if other.pole == best.pole or shares[other.site].value - shares[best.site].value < MIN_NOTICED_LEAD:
+        return ""
+    return (
+        f"People would notice more from {other.site} ({shares[other.site].cell}) than from {best.site} "
+        f"({shares[best.site].cell}); sites are ranked by what detectors should find."
+    )
+
+
+def lossless_note(ranking: Ranking, scenario: Scenario) -> str:
+    """Return a sentence if what people would notice is an upper limit, as losses of returns are off; else empty."""
+    if ranking.sites[0].noticed is None or scenario.effects.range_limit is not False:
+        return ""
+    return (
+        "Losses of returns are off (effects.range_limit = false), but the curves of what people notice are for points "
+        "with losses: read that share as an upper limit."
+    )
+
+
+def headline(ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = ()) -> str:
+    """Return the result in one sentence; ``detectors`` as for :func:`level`."""
     best, count = ranking.best, len(ranking.sites)
     top = best[0]
     if not has_traffic:
@@ -27,23 +82,26 @@ def headline(ranking: Ranking, has_traffic: bool) -> str:
         return "No site sees any of the traffic" if count > 1 else f"{top.site} sees none of the traffic"
 
     by_egvs = top.rank_by == "egvs"
-    result = top.by.sentence(top.score)
+    result = level(top, detectors)
     if by_egvs:
         result = f"sees {format_percent(top.entropy_seen)} of the traffic’s uncertainty"
+    of_first = f"; from {top.site}, {result}" if detectors else f": {top.site} {result}"
     if count == 1:
-        return f"{top.site}, the only site, {result}"
+        return f"{top.site}, the only site{':' if detectors else ','} {result}"
     if ranking.is_tie:
         text = f"All {count} sites score the same"
         if by_egvs and len({site.entropy_seen for site in best}) > 1:
             return text
-        return f"{text}: each {result}"
+        return f"{text}: {result}" if detectors else f"{text}: each {result}"
     if len(best) > 4:
-        return f"{top.site} and {len(best) - 1} others share first place among {count} sites: {top.site} {result}"
+        return f"{top.site} and {len(best) - 1} others share first place among {count} sites{of_first}"
     if len(best) > 1:
         names = join_names([site.site for site in best])
-        return f"{names} share first place among {count} sites: {top.site} {result}"
+        return f"{names} share first place among {count} sites{of_first}"
     text = f"{top.site} is the best of {count} sites"
-    return text if by_egvs else f"{text}: it {result}"
+    if by_egvs:
+        return text
+    return f"{text}: {result}" if detectors else f"{text}: it {result}"
 
 
 def more_frames_hint(scenario: Scenario, by: ScoreLabel, recorded: int) -> str:

@@ -29,6 +29,10 @@ _SIZE_NOTE = (
     "shares found differed from the expected ones by {} to {} percentage points for the detectors that it stands "
     "for, and by up to {} for another one (docs/validity.md)."
 ).format(*STUDY.larger_study.level_error_points, STUDY.larger_study.largest_level_error_points)
+_NOTICED_NOTE = (
+    "Found: a box overlaps the vehicle by more than 0.7 (IoU); noticed: people label it within 3 m, by curves from one "
+    "junction, whose errors are in its ± (docs/certainty.md)."
+)
 _COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = (
     "The tilt of {} is outside the range of the validation (pitch {:g} to {:g} degrees, positive is up; roll up to "
@@ -42,7 +46,8 @@ def describe_reliability(
     """Return the reasons to be careful with a ranking, in sentences.
 
     - With several simulations: that errors come from their differences.
-    - By ``expected_detections``: what the standard errors contain, and how far the size of the score was validated.
+    - By ``expected_detections``: what the standard errors contain, and how far the size of the score was validated, and
+      what counts as found and as noticed.
     - The tilt of the best site is outside the range of the validation study.
     - The traffic was recorded: what share of the region the recording covers.
     - The best site is the lowest, the highest or the most tilted of those on its pole, so that others may be better.
@@ -67,6 +72,8 @@ def describe_reliability(
         notes.append(_error_note(seeds, "recording" if recordings else "simulation", detectors))
     if ranking.by.name == DEFAULT_SCORE:
         notes.append(FROM_SENSOR_NOTE if FROM_SENSOR in detectors else _SIZE_NOTE)
+        if best.noticed is not None:
+            notes.append(_NOTICED_NOTE)
     if notes:
         sentences.append(" ".join(notes))
     sentences += [

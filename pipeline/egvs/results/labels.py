@@ -188,6 +188,12 @@ _LABELS = (
         "vehicle, how widely they are spread over it, its distance, and the distance to the next vehicle. "
         f"{_VEHICLES_NOTE}",
     ),
+    ScoreLabel(
+        "noticed", "the share of vehicles noticed", "noticed", "shows {} of vehicles to people",
+        "The share of vehicles that people notice in the sweeps of a site (a box within 3 m), given the points on each "
+        f"vehicle. {_VEHICLES_NOTE}",
+        digits=0,
+    ),
 )  # fmt: skip
 
 SCORE_LABELS = {label.name: label for label in _LABELS}

@@ -16,6 +16,7 @@ from egvs.artefacts.readers import ZoneVisibility, read_placement
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord, have_inputs
 from egvs.results.labels import SCORE_LABELS, ScoreLabel
+from egvs.results.levels import NoticedShare
 from egvs.sensors.sites import Pose, Site
 
 ERROR_COLUMNS = ("score_se", "gain_se", "beats_previous")
@@ -237,12 +238,15 @@ class FusedPlan:
         What they find; ``gain`` is what they find more than the plan. None without ``better_sites``.
     searched
         Whether swaps were tried.
+    noticed
+        What people would notice in the fused clouds of all sensors of the plan; None if unknown.
     """
 
     steps: tuple[PlanStep, ...]
     better_sites: tuple[str, ...] = ()
     better: PlanStep | None = None
     searched: bool = False
+    noticed: NoticedShare | None = None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.errors import InputError
 from egvs.core.wording import format_percent
 from egvs.results.labels import SCORE_LABELS, ScoreLabel
-from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.results.levels import NoticedShare
+from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED
 from egvs.sensors.sites import Pose
 
 CLOSE_SHARE = 0.01
@@ -44,6 +45,8 @@ class RankedSite:
         None where no standard errors were computed, and for a score without several detectors.
     longitude_deg, latitude_deg
         None where the scenario has no reference system.
+    noticed_low, noticed_high
+        None where expected detections were not computed, and in files of earlier versions.
     user_columns
         Names and texts of the user's columns of the sites file.
     rank_by
@@ -74,6 +77,8 @@ class RankedSite:
     best_beats: float | None = None
     longitude_deg: float | None = None
     latitude_deg: float | None = None
+    noticed_low: float | None = None
+    noticed_high: float | None = None
     user_columns: tuple[tuple[str, str], ...] = ()
     rank_by: str = "egvs"
     others: tuple[ScoreValue, ...] = ()
@@ -137,6 +142,24 @@ class RankedSite:
         if self.rank_by == "egvs":
             return self.egvs_se
         return next((other.se for other in self.others if other.name == self.rank_by), None)
+
+    @property
+    def noticed(self) -> NoticedShare | None:
+        """Share of vehicles that people notice in the sweeps; None where it is unknown."""
+        share = next((other for other in self.others if other.name == NOTICED), None)
+        if share is None or self.noticed_low is None or self.noticed_high is None:
+            return None
+        return NoticedShare(share.value, share.se, self.noticed_low, self.noticed_high)
+
+    @property
+    def noticed_cell(self) -> str:
+        """That share as a cell of a table, without its error."""
+        return "-" if self.noticed is None else self.noticed.cell
+
+    @property
+    def noticed_text(self) -> str:
+        """That share with its error."""
+        return "-" if self.noticed is None else self.noticed.text
 
     def value_of(self, name: str) -> float | None:
         """Return the value of a score; None where it was not computed, or is not defined."""
@@ -307,6 +330,11 @@ class Ranking:
     def companion_score(self) -> ScoreLabel | None:
         """The score shown beside the one that ranks; None if it was not computed."""
         return companion_score(self.sites)
+
+    @property
+    def has_noticed(self) -> bool:
+        """Whether it is known what people notice from each site."""
+        return all(site.noticed is not None for site in self.sites)
 
     @property
     def is_located(self) -> bool:

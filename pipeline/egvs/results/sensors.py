@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Any
 
@@ -65,6 +65,14 @@ class ScoreDifference:
     def from_entry(cls, entry: Mapping[str, Any]) -> ScoreDifference:
         """Return the paired difference that a command has recorded in the run folder."""
         return cls(entry["value"], entry["se"], entry["better"], is_paired=True)
+
+    def widened(self, half_width: float) -> ScoreDifference:
+        """Return the difference with the root mean square of another error added in quadrature."""
+        if half_width == 0.0:
+            return self
+        se = math.hypot(self.se or 0.0, half_width)
+        better = round(NormalDist().cdf(self.value / se), _PROBABILITY_DIGITS)
+        return replace(self, se=se, better=better)
 
     @property
     def is_clear(self) -> bool:
@@ -215,10 +223,13 @@ class SensorComparison:
         By cost, followed by those without a cost by score; all by score with fewer than two costs.
     has_costs
         Whether at least two costs are known, so that they can be compared.
+    has_loss_interval
+        Whether errors of differences contain the interval of the losses of returns.
     """
 
     results: tuple[SensorResult, ...]
     has_costs: bool
+    has_loss_interval: bool = False
 
     @classmethod
     def of(

@@ -34,11 +34,18 @@ class EffectParameters(StrictModel):
 
 
 class RangeLimitParameters(EffectParameters):
-    """Detection range by the reflectivity of the target."""
+    """Losses of returns by range and reflectivity, and a constant share; each key replaces the value of all sensors."""
 
-    reflectivity: float = Field(0.1, gt=0, description="Reflectivity of targets: dark vehicles 0.1, white ones 0.8")
+    reflectivity: float | None = Field(
+        None, gt=0, description="Reflectivity of all targets. By default that of each class of road users: 0.03"
+    )
     incidence_deg: float = Field(0.0, ge=0, lt=90, description="Angle between the beam and the normal of the target")
-    softness: float = Field(0.3, ge=0, description="Standard deviation of the logarithm of the received power")
+    softness: float | None = Field(
+        None, ge=0, description="Standard deviation of the logarithm of the received power. By default each sensor's"
+    )
+    dropout: float | None = Field(
+        None, ge=0, le=1, description="Share of returns that are lost at any range. By default each sensor's"
+    )
     rated_range_m: float | None = Field(None, gt=0, description="Rated range, instead of each sensor's")
     rated_reflectivity: float | None = Field(None, gt=0, description="Rated reflectivity, instead of each sensor's")
 
@@ -203,7 +210,9 @@ class EffectsConfig(StrictModel):
 
     model_config = ConfigDict(extra="allow", json_schema_extra={"additionalProperties": False})
 
-    range_limit: RangeLimitParameters | None = None
+    range_limit: RangeLimitParameters | Literal[False] | None = Field(
+        None, description="Losses of returns. By default they act where they can change a result; false: never"
+    )
     rain: RainParameters | None = None
     fog: FogParameters | None = None
     dropout: DropoutParameters | None = None
@@ -224,16 +233,22 @@ class EffectsConfig(StrictModel):
     @property
     def named(self) -> dict[str, EffectParameters]:
         """The effects that the scenario names, in the order of composition: built-in ones, then those of plugins."""
-        built_in = {name: getattr(self, name) for name in self.BUILT_IN if getattr(self, name) is not None}
+        built_in = {name: getattr(self, name) for name in self.BUILT_IN if getattr(self, name)}
         return built_in | self.__pydantic_extra__
 
     def only(self, *names: str) -> Self:
         """Return the named effects, limited to ``names``."""
-        return self.model_validate({name: value for name, value in self.named.items() if name in names})
+        kept: dict[str, Any] = {name: value for name, value in self.named.items() if name in names}
+        if self.range_limit is not None and "range_limit" not in kept:
+            kept["range_limit"] = False  # None would let it act where it can change a result
+        return self.model_validate(kept)
 
     def without(self, name: str) -> Self:
-        """Return the named effects except one."""
-        return self.only(*(other for other in self.named if other != name))
+        """Return the named effects except one, which is off."""
+        others: dict[str, Any] = {other: value for other, value in self.named.items() if other != name}
+        if name == "range_limit" or self.range_limit is False:
+            others["range_limit"] = False  # None would let it act where it can change a result
+        return self.model_validate(others)
 
     @model_validator(mode="after")
     def _check_plugins(self) -> Self:
@@ -245,7 +260,8 @@ class EffectsConfig(StrictModel):
     @model_serializer(mode="plain")
     def _serialize(self) -> dict[str, Any]:
         """As the user wrote them, without defaults."""
-        return {name: value.model_dump(mode="json", exclude_unset=True) for name, value in self.named.items()}
+        written = {name: value.model_dump(mode="json", exclude_unset=True) for name, value in self.named.items()}
+        return {"range_limit": False, **written} if self.range_limit is False else written
 
 
 EffectsConfig.BUILT_IN = tuple(EffectsConfig.model_fields)

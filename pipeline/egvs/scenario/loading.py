@@ -35,10 +35,13 @@ from egvs.scenario.traffic_config import (
 _ALTERNATIVE = re.compile(r"\.(?:(?:constrained-)?(?:float|int|str)|(?:literal|tuple)\[.*\])$")
 """End of pydantic's location of an error in a value that may have one of several types."""
 
+_TABLE_NAME = re.compile(r"\.[A-Z][A-Za-z]+Parameters(?=\.|$)")
+"""Pydantic's location of a table that may also be a single value: the name of its class."""
+
 _EXPECTATION = re.compile(r"[A-Z]\w+ should (?:be|have) (?P<what>.+?)(?: after validation, not .+)?$")
 """Most messages of pydantic: "Input should be a valid number"."""
 
-_TOML_TERMS = {"an object": "a table", "a valid array": "a list"}
+_TOML_TERMS = {"an object": "a table", "a valid array": "a list", "False": "false"}
 
 
 class _KeyProblem(NamedTuple):
@@ -96,7 +99,10 @@ def _describe(problem: _KeyProblem, expected: list[str]) -> str:
 def _key_problems(error: ValidationError, model: type[BaseModel], parents: tuple[str, ...]) -> Iterator[_KeyProblem]:
     """Yield all problems of a table of a type ``model``; ``parents`` are the keys of the tables around it."""
     for item in error.errors():
+        if item["type"] == "literal_error" and isinstance(item["input"], dict):
+            continue  # a table that may also be a single value; the problems of the table are reported
         key = ".".join(str(part) for part in (*parents, *item["loc"]) if part != "[key]")
+        key = _TABLE_NAME.sub("", key)
         value = repr(item["input"])
         context = item.get("ctx", {})
         match item["type"]:

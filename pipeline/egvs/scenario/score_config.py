@@ -24,15 +24,23 @@ VehicleClass = Literal[
 ]  # fmt: skip
 """SUMO's vClasses."""
 
-OtherScore = Literal[
-    "expected_detections", "seen_well", "points_on_target", "entropy_seen", "coverage", "expected_visibility"
+RankingScore = Literal[
+    "egvs", "expected_detections", "seen_well", "points_on_target", "entropy_seen", "coverage", "expected_visibility"
 ]  # fmt: skip
-"""Scores besides the EGVS."""
+"""Scores that sites can be ranked by."""
+
+OtherScore = Literal[
+    "expected_detections", "noticed", "seen_well", "points_on_target", "entropy_seen", "coverage", "expected_visibility"
+]  # fmt: skip
+"""Scores besides the EGVS. ``noticed`` ranks no sites: it does not ask how well a box fits."""
 
 DEFAULT_SCORE: OtherScore = "expected_detections"
 """The score that the validation study recommends (docs/validity.md), and that new scenarios rank by."""
 
-VEHICLE_SCORES: tuple[OtherScore, ...] = ("expected_detections", "seen_well", "points_on_target")
+NOTICED: OtherScore = "noticed"
+"""The score that is computed beside :data:`DEFAULT_SCORE`: what people notice, where that is what detectors find."""
+
+VEHICLE_SCORES: tuple[OtherScore, ...] = ("expected_detections", "noticed", "seen_well", "points_on_target")
 """Scores that are means over the vehicles of recorded frames."""
 
 Detector = Literal["cluster", "pointpillars", "pointpillars_sensor"]
@@ -149,7 +157,7 @@ class ScoreConfig(StrictModel):
         description="Cap of the beams that count in one voxel: 0, at least 1e-9, or inf. 'auto' depends on the "
         "size of voxels: 10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), and half of that with moving_occlusion",
     )
-    rank_by: Literal["egvs", OtherScore] = Field("egvs", description="Score that sites are ranked by")
+    rank_by: RankingScore = Field("egvs", description="Score that sites are ranked by")
     others: tuple[OtherScore, ...] = Field(
         (DEFAULT_SCORE,), description="Further scores in scores.parquet, besides egvs and the score of rank_by"
     )
@@ -244,10 +252,16 @@ class ScoreConfig(StrictModel):
 
     @property
     def additional(self) -> tuple[OtherScore, ...]:
-        """The scores to compute besides the EGVS, without duplicates; the one that sites are ranked by is the first."""
-        if self.rank_by == "egvs":
-            return self.others
-        return (self.rank_by, *(name for name in self.others if name != self.rank_by))
+        """The scores to compute besides the EGVS, without duplicates; the one that sites are ranked by is the first.
+
+        :data:`NOTICED` is computed whenever :data:`DEFAULT_SCORE` is.
+        """
+        names = self.others
+        if self.rank_by != "egvs":
+            names = (self.rank_by, *(name for name in self.others if name != self.rank_by))
+        if DEFAULT_SCORE in names and NOTICED not in names:
+            names += (NOTICED,)
+        return names
 
 
 Share = Annotated[float, Field(gt=0, le=1)]

@@ -12,7 +12,10 @@ from egvs.scenario.fields import NotNegative, Positive, StrictModel
 MAX_RINGS = 10_000
 """More than ten times as many as any sensor has."""
 
-_OPTICS_KEYS = ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity", "range_sigma_m")
+OPTICS_KEYS = (
+    "wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity", "softness", "dropout", "range_sigma_m",
+)  # fmt: skip
+"""Keys of the laser and the receiver."""
 _FIELD_OF_VIEW_KEYS = ("azimuth_deg", "beams", "pattern")
 _RING_KEYS = ("channels", "azimuth_offsets_deg", "azimuth_step_deg", "azimuth_deg")
 
@@ -74,9 +77,15 @@ class SensorConfig(StrictModel):
         (3.0, 1.5), description="Full divergence angles in azimuth and elevation, at 1/e^2; for effects only"
     )
     rated_range_m: Positive | None = Field(
-        None, description="Range at which a target of rated_reflectivity is just detected; for effects only"
+        None, description="Range at which a target of rated_reflectivity is just detected; without it, no losses"
     )
     rated_reflectivity: Positive = Field(0.8, description="Reflectivity of the target of rated_range_m")
+    softness: NotNegative = Field(
+        1.0, description="Standard deviation of the logarithm of the power that vehicles return; fitted on two units"
+    )
+    dropout: float = Field(
+        0.05, ge=0, le=1, description="Share of returns from vehicles that are lost at any range; fitted on two units"
+    )
 
     range_sigma_m: NotNegative = Field(
         0.03, description="Standard deviation of measured ranges; used for point clouds with traffic only"
@@ -85,7 +94,7 @@ class SensorConfig(StrictModel):
     @property
     def optics(self) -> dict[str, Any]:
         """Properties of the laser and the receiver, which effects use."""
-        return {name: getattr(self, name) for name in _OPTICS_KEYS}
+        return {name: getattr(self, name) for name in OPTICS_KEYS}
 
     @property
     def rings(self) -> int:
@@ -108,7 +117,7 @@ class SensorConfig(StrictModel):
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out optics and field of view that are not set, so that they do not change cache keys."""
-        omitted = {*_OPTICS_KEYS, *_FIELD_OF_VIEW_KEYS} - self.model_fields_set
+        omitted = {*OPTICS_KEYS, *_FIELD_OF_VIEW_KEYS} - self.model_fields_set
         return {name: value for name, value in serialize(self).items() if name not in omitted}
 
     @model_validator(mode="after")

@@ -12,6 +12,7 @@ quantity                               of the fused points
 points, points on sides                the sum over sensors
 length share, width share              between the lowest and the highest coordinate of the points of any sensor
 hole                                   the longest run of slices of the length in which no sensor has a point
+with losses of returns                 expected spans and holes: a slice has no point with the product over sensors
 range, depression, angle of view       of the sensor with most points; of equal ones the nearest
 gap to the neighbours, length          of the vehicle, the same for all sensors
 =====================================  =============================================================================
@@ -35,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
-from egvs.scoring.targets import TargetVisibility, longest_holes_m, span_shares
+from egvs.scoring.targets import SliceMisses, TargetVisibility, slice_misses, spans_and_holes
 
 
 def fuse_targets(views: Sequence[TargetVisibility]) -> TargetVisibility:
@@ -62,7 +63,8 @@ def fuse_targets(views: Sequence[TargetVisibility]) -> TargetVisibility:
     high_m = np.max([view.bounds_m[:, 1] for view in views], axis=0)
     bounds_m = np.stack([low_m, high_m], axis=1)
     slices: NDArray[np.uint64] = np.bitwise_or.reduce([view.slices for view in views])
-    spans = span_shares(record, bounds_m)
+    misses = _fused_misses(views)
+    spans, hole_m = spans_and_holes(record, bounds_m, slices, misses)
     return TargetVisibility(
         record=record,
         points=_sum([view.points for view in views]),
@@ -70,13 +72,23 @@ def fuse_targets(views: Sequence[TargetVisibility]) -> TargetVisibility:
         points_on_sides=_sum([view.points_on_sides for view in views]),
         length_share=spans[:, 0],
         width_share=spans[:, 1],
-        hole_m=longest_holes_m(record, slices),
+        hole_m=hole_m,
         range_m=np.array([view.range_m for view in views])[best, rows],
         depression_deg=np.array([view.depression_deg for view in views])[best, rows],
         side=np.array([view.side for view in views])[best, rows],
         bounds_m=bounds_m,
         slices=slices,
+        misses=misses,
     )
+
+
+def _fused_misses(views: Sequence[TargetVisibility]) -> SliceMisses | None:
+    """Return the probability that a slice has no point of any sensor; None if no sensor loses returns."""
+    if all(view.misses is None for view in views):
+        return None
+    misses = np.sort([slice_misses(view) for view in views], axis=0)
+    fused: NDArray[np.float32] = np.multiply.reduce(misses, axis=0)
+    return SliceMisses(np.arange(len(fused)), fused)
 
 
 def _best_views(views: Sequence[TargetVisibility]) -> IntArray:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.scoring.blindspots import CELL_M, blindspot_map_shape
-from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord, visible_targets
+from egvs.scoring.targets import SEEN_WELL_POINTS, ByRange, TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.traffic.network import Lane, Network, is_carriageway
 
@@ -136,9 +136,7 @@ class TargetPositions:
     def _record(self) -> TargetRecord:
         return TargetRecord.alone(self.boxes, self.target.kind, self.grid)
 
-    def points_map(
-        self, beams: Beams, return_probability: Callable[[FloatArray], FloatArray] | None = None
-    ) -> PointsMap:
+    def points_map(self, beams: Beams, return_probability: ByRange | None = None) -> PointsMap:
         """Return the points at each square, the fewest where several boxes stand on it.
 
         Parameters
@@ -146,7 +144,7 @@ class TargetPositions:
         beams
             The empty scan of a site.
         return_probability
-            Probability that a return from each range (n,) is detected; 1 where it is None.
+            As for :func:`egvs.scoring.targets.visible_targets`.
         """
         values = np.full(blindspot_map_shape(self.grid), np.inf)
         if len(self.boxes):

@@ -44,6 +44,14 @@ those of a t distribution with one degree of freedom, and cautious. What changes
 same time is in both terms, so the sum is slightly too large. The detectors stand for others of their kind. Two are too
 few to say how far a third one may be off.
 
+A score from measured curves (``noticed``) has the errors of their values as well: with :math:`S_k` the score when the
+k-th independent value is larger by its standard error,
+
+.. math:: se^2 = se_{traffic}^2 + \sum_k (S_k - S)^2
+
+and for the difference of two sites the same with the differences. The degrees of freedom of these errors are taken as
+infinite.
+
 Voxels that have equal counts in every group share one class (0.5 million occupied voxels of a real junction make 50,000
 classes), so a site costs one pass over the voxels and one over the classes. Nothing is random; the result does not
 depend on threads or on other sites. Hits are not resampled: where an effect lets traffic hide voxels, its part of the
@@ -89,24 +97,33 @@ _CLASS_KEY_SEED = 0x9E3779B97F4A7C15
 
 @dataclass(frozen=True)
 class BlockGroups:
-    """Consecutive groups of one record; or the detectors of a score, each of which is a group.
+    """Consecutive groups of one record; or the detectors of a score, or the values of its curves, each of them a group.
 
     Attributes
     ----------
     frames
-        Frames of each group, (k,) int64; 1 for each detector.
+        Frames of each group, (k,) int64; 1 for each detector and each value of a curve.
     autocorrelation_frames
         Autocorrelation time of the traffic.
     are_seeds
         Whether each group is a simulation with a seed of its own, so that groups are independent.
     are_detectors
         Whether each group is a detector.
+    are_curve_values
+        Whether each group is a value of a measured curve: its replicate is not the score without the value, but with
+        the value larger by its standard error.
     """
 
     frames: IntArray
     autocorrelation_frames: float
     are_seeds: bool = False
     are_detectors: bool = False
+    are_curve_values: bool = False
+
+    @property
+    def are_traffic(self) -> bool:
+        """Whether the groups are frames of a record."""
+        return not self.are_detectors and not self.are_curve_values
 
     @property
     def total(self) -> int:
@@ -128,6 +145,11 @@ def detector_groups(detectors: int) -> tuple[BlockGroups, ...]:
     if detectors < 2:
         return ()
     return (BlockGroups(np.ones(detectors, dtype=np.int64), 0.0, are_detectors=True),)
+
+
+def curve_groups(values: int) -> tuple[BlockGroups, ...]:
+    """Return the values of the curves of a score as groups whose errors shift it in turn."""
+    return (BlockGroups(np.ones(values, dtype=np.int64), 0.0, are_curve_values=True),)
 
 
 @dataclass(frozen=True)
@@ -339,14 +361,14 @@ def _exact_entropies(counts: IntArray, frames: int, grid: Grid) -> FloatArray:
 
 @dataclass(frozen=True)
 class Stratum:
-    """The jackknife of the scores of n sites over the k groups of one record, or over k detectors.
+    """The jackknife of the scores of n sites over the k groups of one record, or over k detectors or curve values.
 
     Attributes
     ----------
     pseudo
-        Pseudo-values, (k, n) float64: estimates of the score from each group.
+        Pseudo-values, (k, n) float64: estimates of the score from each group. Of curve values, the shifted scores.
     spread
-        h_g - 1 of each group, (k,) float64.
+        h_g - 1 of each group, (k,) float64; 1 / k of curve values, whose variances add up.
     centre
         The score without its bias of this record, (n,) float64.
     widening
@@ -379,6 +401,9 @@ class Stratum:
         Groups are joined where the first ``n_joined_by`` scores are correlated; all scores when None.
         """
         frames = groups.frames
+        if groups.are_curve_values:
+            spread = np.full(len(frames), 1.0 / len(frames))
+            return cls(left_out, spread, scores, 1.0, groups, 0.0, 1, still_correlated=False)
         h = groups.total / frames
         centre = len(h) * scores - ((1.0 - 1.0 / h)[:, None] * left_out).sum(axis=0)
         pseudo = h[:, None] * scores - (h - 1.0)[:, None] * left_out
@@ -411,7 +436,7 @@ class Stratum:
     @property
     def is_short(self) -> bool:
         """Whether blocks are shorter than the window in which the autocorrelation time was estimated."""
-        if self.groups.are_seeds or self.groups.are_detectors:
+        if self.groups.are_seeds or not self.groups.are_traffic:
             return False
         return self.groups.total < len(self.pseudo) * WINDOW_TIMES * self.groups.autocorrelation_frames
 
@@ -440,7 +465,7 @@ class ScoreUncertainty:
         Scores of all frames, (n,) float64.
     strata
         The jackknife over each record of the TPOG, one unless it is a mix; then that over the detectors, if there are
-        several.
+        several, and the errors of the curves of a score that has some.
     """
 
     scores: FloatArray
@@ -471,7 +496,7 @@ class ScoreUncertainty:
     @property
     def traffic_strata(self) -> tuple[Stratum, ...]:
         """The jackknife over each record of the TPOG."""
-        return tuple(stratum for stratum in self.strata if not stratum.groups.are_detectors)
+        return tuple(stratum for stratum in self.strata if stratum.groups.are_traffic)
 
     @property
     def detector_strata(self) -> tuple[Stratum, ...]:
@@ -542,7 +567,8 @@ class ScoreUncertainty:
     def _freedoms(self, a: IntArray, b: IntArray | None = None) -> FloatArray:
         """Degrees of freedom of the scores of sites a (m,), or of their lead over sites b (m,): Satterthwaite's."""
         freedoms = np.full(len(a), self.freedom)
-        if not self.detector_strata:
+        curves = tuple(stratum for stratum in self.strata if stratum.groups.are_curve_values)
+        if not self.detector_strata and not curves:
             return freedoms
         traffic = _sum_of_variances(self.traffic_strata, a, b)
         denominator = traffic**2 / self.freedom
@@ -551,6 +577,7 @@ class ScoreUncertainty:
             variance = stratum.variance(a, b)
             denominator += variance**2 / (len(stratum.pseudo) - 1.0)
             total += variance
+        total += _sum_of_variances(curves, a, b)
         np.divide(total**2, denominator, out=freedoms, where=denominator > 0.0)
         return freedoms
 
@@ -604,6 +631,8 @@ def summarise_uncertainty(estimate: ScoreUncertainty, names: Sequence[str] = (""
     text = "; ".join(descriptions)
     for stratum in estimate.detector_strata:
         text += f", and the differences between {len(stratum.pseudo)} detectors"
+    if any(stratum.groups.are_curve_values for stratum in estimate.strata):
+        text += ", and the errors of measured curves"
     return {"standard_errors_from": text}
 
 

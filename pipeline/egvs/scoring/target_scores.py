@@ -35,6 +35,9 @@ each detector at junctions that no result is quoted for (``benchmarks/across_jun
 docs/validity.md shows their accuracy elsewhere). A detection is a box that overlaps the vehicle by more than 0.7, in
 the mean of the overlaps from above and in 3D.
 
+*Noticed*: the share of vehicles that people notice in the sweeps, from curves over points that were measured with
+labelled sweeps (:mod:`egvs.scoring.noticed`).
+
 *People*: pedestrians and bicycles, for whom there is no model, are expected by points. The share of them that is found
 is the share of their observations with at least :data:`PEOPLE_POINTS` points.
 """
@@ -56,6 +59,7 @@ from egvs.core.special import expit
 from egvs.kernels.boosted_trees import add_tree_values
 from egvs.scenario.score_config import MEAN_DETECTORS, Detector
 from egvs.scoring.blindspots import SpotVisibility
+from egvs.scoring.noticed import noticed_chances
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetVisibility, weighted_mean
 
 Gain = Callable[[FloatArray], FloatArray]
@@ -110,8 +114,9 @@ class SiteTargetScores:
     ----------
     scores
         Of all vehicle-frames, then with each group of frames left out, then with each detector left out where the
-        score depends on several, (1 + k,) or (1 + k + d,) float64; (1,) without standard errors. NaN where no vehicle
-        counts.
+        score depends on several, or with each value of its curves shifted by a standard error, (1 + k,) or (1 + k + d,)
+        float64; (1,) without standard errors. NaN where no vehicle counts. Scores of groups of road users are named by
+        :func:`group_score`.
     by_period
         Scores in each period alone, in their order; empty without periods.
     missed
@@ -121,6 +126,11 @@ class SiteTargetScores:
     scores: Mapping[str, FloatArray]
     by_period: tuple[Mapping[str, float], ...] = ()
     missed: SpotVisibility | None = None
+
+
+def group_score(score: str, group: str) -> str:
+    """Return the name of a score of one group of road users."""
+    return f"{score} of {group}"
 
 
 def log_points(points: FloatArray) -> FloatArray:
@@ -325,8 +335,13 @@ def _score_seen_well(visible: TargetVisibility, _: Sequence[str]) -> FloatArray:
     return saturating_gain(visible.points)
 
 
+def _score_noticed(visible: TargetVisibility, _: Sequence[str]) -> FloatArray:
+    return noticed_chances(visible)
+
+
 TARGET_SCORES: Mapping[str, TargetScore] = {
     "expected_detections": _score_detection,
+    "noticed": _score_noticed,
     "points_on_target": _score_points,
     "seen_well": _score_seen_well,
 }

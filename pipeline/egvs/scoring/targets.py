@@ -38,7 +38,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,19 +48,20 @@ from egvs.artefacts.tpog import PeriodBlocks, read_periods
 from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
-from egvs.effects.base import Detect
+from egvs.effects.returns import ReturnProbability, reflectivity_of
 from egvs.kernels import occlusion, vehicle_visibility
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SAMPLED_FRAMES, WeightsConfig
 from egvs.scoring.standard_errors import BlockGroups, block_groups
 from egvs.scoring.visibility import Beams
-from egvs.sensors.scene import Scene
-from egvs.sensors.sensor import Sensor
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 Floats = FloatArray
+
+ByRange = Callable[[FloatArray], FloatArray]
+"""Probability (n,) by range (n,), in metres."""
 
 SEEN_WELL_POINTS = 20.0
 """n0: the gain of a vehicle with this many points is 63 %, with three times as many 95 %."""
@@ -73,6 +74,9 @@ _BANDS = 12
 
 _STRIDE = 13
 """Every so manyth beam tells where bands begin; not a divisor of any common number of channels."""
+
+_STEPS_PER_M = 50.0
+"""Steps of range between which the probability of returns is interpolated."""
 
 MAX_HITS = 2**17
 """Hits that are listed at once, which bounds the memory."""
@@ -189,6 +193,11 @@ class TargetRecord:
     def are_people(self) -> NDArray[np.bool_]:
         """Which rows are on foot or on a bicycle, (n,)."""
         return np.array([kind in NON_VEHICLE_KINDS for kind in self.kinds], dtype=np.bool_)[self.kind]
+
+    @property
+    def reflectivity(self) -> FloatArray:
+        """Reflectivity of each row by its class, (n,) float64."""
+        return reflectivity_of(self.kinds)[self.kind]
 
     @classmethod
     def read(
@@ -309,6 +318,21 @@ def _neighbour_gaps(boxes: AllBoxes, row: IntArray) -> FloatArray:
     return gap_m[row]
 
 
+class SliceMisses(NamedTuple):
+    """Probability that slices of vehicles have no point.
+
+    Attributes
+    ----------
+    rows
+        The vehicle-frames, (k,) int64. Points on any other extend as far as the beams that meet it.
+    misses
+        Of the slices of the length, and of the width, of all vehicle-frames, (n, 2, 64) float32; 1 for the others.
+    """
+
+    rows: IntArray
+    misses: NDArray[np.float32]
+
+
 @dataclass(frozen=True, eq=False)
 class TargetVisibility:
     """What one sensor, or several together, see of the vehicle-frames of a record, row by row, n of them.
@@ -326,11 +350,11 @@ class TargetVisibility:
         Those of ``points`` that are not on its roof (or, from below, its underside), (n,) float64.
     length_share, width_share
         Share of the vehicle's length and of its width between the outermost of its points, along the box's axes, (n,)
-        float64, 0 to 1; 0 without a point. Where effects weight beams or lose returns, a beam whose point has any
-        probability at all counts in full.
+        float64, 0 to 1; 0 without a point. With losses of returns, the expected share. Where other effects weight beams
+        or lose returns, a beam whose point has any probability at all counts in full.
     hole_m
         Longest stretch of the vehicle's length, between its outermost points, without a point, (n,) float64, to 1/64 of
-        its length; 0 without a point. Counted as the shares are.
+        its length; 0 without a point. With losses of returns, its expected value.
     range_m
         From the sensor to the box's centre, (n,) float64.
     depression_deg
@@ -339,11 +363,14 @@ class TargetVisibility:
         Sine of the angle in plan between the line of sight and the vehicle's length, (n,) float64: 0 from ahead or
         behind, 1 broadside.
     bounds_m
-        Lowest and highest coordinate of its points, along and across the vehicle from its centre, (n, 2, 2) float64;
-        infinite and minus infinite without a point.
+        Lowest and highest coordinate of its points, of any probability, along and across the vehicle from its centre,
+        (n, 2, 2) float64; infinite and minus infinite without a point.
     slices
-        Which of the 64 equal slices of the vehicle's length, from the rear, have a point: one bit each, (n,) uint64.
-        Counted as the shares are.
+        Which of the 64 equal slices of the vehicle's length, from the rear, have a point of any probability: one bit
+        each, (n,) uint64.
+    misses
+        With losses of returns, the probability that slices have no point, for vehicles of which that matters; None
+        without.
     """
 
     record: TargetRecord
@@ -358,6 +385,7 @@ class TargetVisibility:
     side: FloatArray
     bounds_m: FloatArray
     slices: NDArray[np.uint64]
+    misses: SliceMisses | None
 
     def __len__(self) -> int:
         """Number of vehicle-frames."""
@@ -377,9 +405,7 @@ class VisibleTargets(TargetVisibility):
     sensor_m: FloatArray
 
 
-def visible_targets(
-    record: TargetRecord, beams: Beams, return_probability: Callable[[FloatArray], FloatArray] | None = None
-) -> VisibleTargets:
+def visible_targets(record: TargetRecord, beams: Beams, return_probability: ByRange | None = None) -> VisibleTargets:
     """Return what a site sees of the vehicle-frames of a record.
 
     Parameters
@@ -389,7 +415,8 @@ def visible_targets(
     beams
         The site's empty scan.
     return_probability
-        Probability that a return from each range (n,) is detected; 1 where it is None.
+        Probability that a return from each range (n,) is detected; 1 where it is None. With losses, a
+        :class:`egvs.effects.returns.ReturnProbability`, which also depends on the reflectivity of each vehicle.
     """
     row, boxes = record.row, record.all_boxes.values[record.row]
     yaw_rad = boxes[:, 3]
@@ -401,10 +428,13 @@ def visible_targets(
 
     hits = _count_points(record, sensor_m, beams, return_probability)
     points_alone = hits.alone[row]
-    if return_probability is not None:
+    if isinstance(return_probability, ReturnProbability):
+        points_alone = points_alone * return_probability(range_m, record.reflectivity)
+    elif return_probability is not None:
         points_alone = points_alone * return_probability(range_m)
     bounds_m, slices = np.stack([hits.low[row], hits.high[row]], axis=1), hits.slices[row]
-    spans = span_shares(record, bounds_m)
+    misses = hits.misses
+    spans, hole_m = spans_and_holes(record, bounds_m, slices, misses)
     return VisibleTargets(
         record=record,
         points=hits.points[row],
@@ -412,14 +442,57 @@ def visible_targets(
         points_on_sides=hits.on_sides[row],
         length_share=spans[:, 0],
         width_share=spans[:, 1],
-        hole_m=longest_holes_m(record, slices),
+        hole_m=hole_m,
         range_m=range_m,
         depression_deg=np.degrees(np.arctan2(-away_m[:, 2], run_m)),
         side=np.divide(across_m, run_m, out=np.zeros(len(row)), where=run_m > 0.0),
         bounds_m=bounds_m,
         slices=slices,
+        misses=misses,
         sensor_m=sensor_m,
     )
+
+
+def spans_and_holes(
+    record: TargetRecord, bounds_m: FloatArray, slices: NDArray[np.uint64], misses: SliceMisses | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the shares of length and width between the outermost points, (n, 2), and the longest holes, (n,), metres.
+
+    Both are expected values where returns are lost.
+
+    Parameters
+    ----------
+    record
+        The vehicles.
+    bounds_m, slices, misses
+        As in :class:`TargetVisibility`.
+    """
+    spans, hole = span_shares(record, bounds_m), np.zeros(len(record))
+    vehicle_visibility.longest_slice_gaps(slices, hole)
+    sizes_m = np.ascontiguousarray(record.all_boxes.values[record.row, 5:7])
+    if misses is not None:
+        vehicle_visibility.expected_spans(misses.misses, misses.rows, bounds_m, sizes_m, spans)
+        vehicle_visibility.expected_gaps(misses.misses, misses.rows, hole)
+    return spans, hole * sizes_m[:, 0]
+
+
+def slice_misses(visible: TargetVisibility) -> NDArray[np.float32]:
+    """Return the probability that each slice has no point: of the length, and of the width, (n, 2, 64) float32.
+
+    Of vehicles on which no loss matters, it is 0 or 1, and of the width 0 in the slices with the outermost points.
+    """
+    parts = np.arange(vehicle_visibility.SLICES)
+    misses = np.ones((len(visible), 2, len(parts)), dtype=np.float32)
+    misses[:, 0] = (visible.slices[:, None] >> parts.astype(np.uint64)) & np.uint64(1) == 0
+    rows = np.flatnonzero(visible.points > 0.0)
+    width_m = visible.record.all_boxes.values[visible.record.row[rows], 6]
+    for end_m in (visible.bounds_m[rows, 0, 1], visible.bounds_m[rows, 1, 1]):
+        part = np.clip(len(parts) * (end_m / width_m + 0.5), 0, len(parts) - 1).astype(np.int64)
+        misses[rows, 1, part] = 0.0
+    if visible.misses is not None:
+        rows = visible.misses.rows
+        misses[rows] = visible.misses.misses[rows]
+    return misses
 
 
 def span_shares(record: TargetRecord, bounds_m: FloatArray) -> FloatArray:
@@ -440,40 +513,6 @@ def span_shares(record: TargetRecord, bounds_m: FloatArray) -> FloatArray:
     return shares
 
 
-def longest_holes_m(record: TargetRecord, slices: NDArray[np.uint64]) -> FloatArray:
-    """Return the longest stretch of each vehicle's length between its points without a point, (n,) float64, metres.
-
-    Parameters
-    ----------
-    record
-        The vehicles.
-    slices
-        As in :class:`TargetVisibility`, (n,) uint64.
-    """
-    share = np.zeros(len(record))
-    vehicle_visibility.longest_slice_gaps(slices, share)
-    length_m: FloatArray = record.all_boxes.values[record.row, 5]
-    return share * length_m
-
-
-def detection_probability(scene: Scene, sensor: Sensor) -> Callable[[FloatArray], FloatArray] | None:
-    """Return the probability that a return from each range (n,) is detected, with all effects of a scene.
-
-    None where no effect loses returns.
-    """
-    effects: tuple[Detect[Any], ...] = scene.acting(Detect, "score")
-    if not effects:
-        return None
-
-    def probability(range_m: FloatArray) -> FloatArray:
-        product = np.ones(len(range_m))
-        for effect in effects:
-            product = product * effect.detect(range_m, sensor)
-        return product
-
-    return probability
-
-
 class _BoxHits(NamedTuple):
     """Points on every box of a record, (b,); ``low`` and ``high`` bound them along the box's axes, (b, 2), metres."""
 
@@ -485,24 +524,62 @@ class _BoxHits(NamedTuple):
     """Which slices of the box's length have points, as bits."""
     low: FloatArray
     high: FloatArray
+    misses: SliceMisses | None
+    """See :class:`TargetVisibility`."""
+
+
+class Losses(NamedTuple):
+    """Losses of returns in the form that :func:`egvs.kernels.vehicle_visibility.first_hits` takes."""
+
+    shares: FloatArray
+    share_row: IntArray
+    per_m: float
+    miss_row: IntArray
+    misses: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, record: TargetRecord, return_probability: ReturnProbability, farthest_m: float) -> Losses:
+        """Tabulate the probability of returns up to a range, for each reflectivity of the record."""
+        if not len(record):
+            return NO_LOSSES
+        reflectivity, row = np.unique(record.reflectivity, return_inverse=True)
+        range_m = np.arange(math.ceil(farthest_m * _STEPS_PER_M) + 2) / _STEPS_PER_M
+        shares = [return_probability(range_m, np.full(len(range_m), rho)) for rho in reflectivity]
+        count = len(record.all_boxes.values)
+        share_row, miss_row = np.zeros(count, dtype=np.int64), np.full(count, -1, dtype=np.int64)
+        share_row[record.row], miss_row[record.row] = row, np.arange(len(record))
+        misses = np.ones((len(record), 2, vehicle_visibility.SLICES), dtype=np.float32)
+        return cls(np.array(shares).reshape(len(shares), -1), share_row, _STEPS_PER_M, miss_row, misses)
+
+    def filled(self, record: TargetRecord, slices: NDArray[np.uint64]) -> SliceMisses:
+        """Return the probabilities that the kernel has filled; ``slices`` are those of all boxes that have points."""
+        rows = np.flatnonzero((self.miss_row[record.row] >= 0) & (slices[record.row] != 0))
+        return SliceMisses(rows, self.misses)
+
+
+_NO_ROWS = np.empty(0, dtype=np.int64)
+_NO_MISSES = np.empty((0, 2, vehicle_visibility.SLICES), dtype=np.float32)
+NO_LOSSES = Losses(np.empty((0, 0)), _NO_ROWS, 1.0, _NO_ROWS, _NO_MISSES)
+"""Every return is detected."""
 
 
 def _count_points(
-    record: TargetRecord,
-    sensor_m: FloatArray,
-    site: Beams,
-    return_probability: Callable[[FloatArray], FloatArray] | None,
+    record: TargetRecord, sensor_m: FloatArray, site: Beams, return_probability: ByRange | None
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
-    is_counted = site.weight is None and return_probability is None
+    losses, has_losses = NO_LOSSES, isinstance(return_probability, ReturnProbability) and return_probability.thins_spans
+    is_counted = site.weight is None and (return_probability is None or has_losses)
     beams = sort_beams(site, _BANDS if is_counted else 1)
+    if isinstance(return_probability, ReturnProbability) and has_losses:
+        losses = Losses.of(record, return_probability, float(beams.length_m.max(initial=0.0)))
+        return_probability = None
     is_target = np.zeros(count, dtype=np.bool_)
     is_target[record.row] = True
     size_m = np.asarray(record.grid.roi.size_m)
     all_boxes = *boxes.between(sensor_m, size_m), boxes.values, boxes.low, boxes.high, is_target
 
     bounds = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
-    result = _BoxHits(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds)
+    sums = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds
     nearest_m = beams.length_m.copy()
     capacity = 0
     if return_probability is not None:
@@ -512,13 +589,13 @@ def _count_points(
     frame = 0
     while frame < len(record.numbers):
         frame, filled = vehicle_visibility.first_hits(
-            frame, sensor_m, size_m, all_boxes, tuple(beams), nearest_m, tuple(result), hits
+            frame, sensor_m, size_m, all_boxes, tuple(beams), nearest_m, tuple(losses), sums, hits
         )
         if return_probability is not None:
             box, row, hit_range_m, along_m, across_m = (column[:filled] for column in hits)
             weight = beams.weight[row] * return_probability(hit_range_m)
-            vehicle_visibility.accumulate_hits(box, weight, along_m, across_m, boxes.values, tuple(result[1:]))
-    return result
+            vehicle_visibility.accumulate_hits(box, weight, along_m, across_m, boxes.values, sums[1:])
+    return _BoxHits(*sums, None if losses is NO_LOSSES else losses.filled(record, sums[3]))
 
 
 class SortedBeams(NamedTuple):

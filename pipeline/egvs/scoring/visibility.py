@@ -23,7 +23,6 @@ import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,9 +30,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts.tpog import Tpog
-from egvs.core.errors import InputError, RunError
+from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
-from egvs.effects.base import Detect, Effect, TransmitScore
+from egvs.effects.base import Detect, TransmitScore
+from egvs.effects.returns import ReturnProbability, checked_shares
 from egvs.kernels import hits as hit_kernels
 from egvs.kernels import traversal
 from egvs.scoring.egvs import Hits as Hits
@@ -150,9 +150,10 @@ class HitCounter:
         self._grid = tpog.grid
         transmit: tuple[TransmitScore[Any], ...] = scene.acting(TransmitScore, "score")
         self._transmit = tuple(effect.prepare(scene, tpog, trajectories) for effect in transmit)
-        self._detect: tuple[Detect[Any], ...] = scene.acting(Detect, "score")
+        self._scene = scene
         self.unit = 1
-        if transmit or self._detect or scene.weights_beams:
+        detect: tuple[Detect[Any], ...] = scene.acting(Detect, "score")
+        if transmit or detect or scene.weights_beams:
             self.unit = UNIT
         self._local = threading.local()
 
@@ -184,8 +185,9 @@ class HitCounter:
             self._add_shares(beams, segments, weighted)
             hits, scale = weighted, 1
 
-        if self._detect:
-            self._thin(hits, scale, beams.sensor, segments.origin, cells, weighted)
+        probability = ReturnProbability.of(self._scene, beams.sensor)
+        if probability is not None:
+            self._thin(hits, scale, probability, segments.origin, cells, weighted)
         elif hits is not weighted:
             np.multiply(hits, scale, out=weighted, dtype=np.int64)
         return weighted
@@ -227,46 +229,30 @@ class HitCounter:
             steps = effects[0].transmittance_steps(beams.ends_m)
         if steps is not None:
             for part in steps:
-                share = _checked_shares(effects[0], part.share, len(part.range_m), "transmittance_steps")
+                share = checked_shares(effects[0], part.share, len(part.range_m), "transmittance_steps")
                 hit_kernels.add_stepwise_shares(
                     *segments, voxel_m, part.rows, part.first, part.range_m, share, weights, UNIT, hits
                 )
             return
 
         for piece in voxel_crossings.list_crossings(beams.pose.position_m, beams.ends_m, self._grid):
-            shares = [_checked_shares(effect, effect.share(piece), len(piece.cells), "crossings") for effect in effects]
+            shares = [checked_shares(effect, effect.share(piece), len(piece.cells), "crossings") for effect in effects]
             hit_kernels.add_shares(piece.first, piece.cells, weights[piece.rows], math.prod(shares), UNIT, hits)
 
     def _thin(
-        self, hits: Hits, scale: int, sensor: Sensor, origin: FloatArray, cells: IntArray | None, thinned: IntArray
+        self,
+        hits: Hits,
+        scale: int,
+        probability: ByRange,
+        origin: FloatArray,
+        cells: IntArray | None,
+        thinned: IntArray,
     ) -> None:
         """Fill ``thinned`` at ``cells`` with the detected part of ``hits`` times ``scale``."""
         if cells is None:
             cells = np.arange(len(thinned))
-        table = RangeTable.over(partial(self._detected, sensor), origin * self._grid.voxel_m, self._grid)
+        table = RangeTable.over(probability, origin * self._grid.voxel_m, self._grid)
         table.thin(hits, scale, origin, self._grid, cells, thinned)
-
-    def _detected(self, sensor: Sensor, range_m: FloatArray) -> FloatArray:
-        """Probability that all effects together leave a return from each range (n,)."""
-        detected = np.ones(len(range_m))
-        for effect in self._detect:
-            detected = detected * _checked_shares(effect, effect.detect(range_m, sensor), len(range_m), "ranges")
-        return detected
-
-
-def _checked_shares(effect: Effect[Any], shares: object, count: int, unit: str) -> FloatArray:
-    """Return the ``count`` shares of an effect; raise a RunError for anything else, which would give a wrong score."""
-    if not isinstance(shares, np.ndarray):
-        actual = f"{type(shares).__name__}"
-    elif shares.dtype.kind not in "fiub":
-        actual = f"{type(shares).__name__} of {shares.dtype}"
-    elif shares.shape != (count,):
-        actual = f"an array of shape {shares.shape} for {count} {unit}"
-    elif shares.size and not (shares.min() >= 0 and shares.max() <= 1):  # false where one is NaN
-        actual = f"values from {shares.min():g} to {shares.max():g}"
-    else:
-        return shares
-    raise RunError(f"effects.{effect.NAME}: expected one share from 0 to 1 for each of {count} {unit}, got {actual}")
 
 
 @dataclass(frozen=True, eq=False)

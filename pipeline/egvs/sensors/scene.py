@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, TypeVar
 
 from egvs.core.grid import Roi
 from egvs.scenario.model import Scenario
+from egvs.sensors.return_model import LossDecision
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.sites import Pose, Site
 from egvs.world.supports import Supports
@@ -57,6 +58,8 @@ class Scene:
         Effects of these stages that provably change nothing here.
     dropped
         Candidates of a rule where no pole can stand, each with the reason.
+    losses
+        Which sensors need losses of returns; None before effects are added, and where the scenario decides it.
     """
 
     scenario: Scenario
@@ -65,6 +68,7 @@ class Scene:
     effects: tuple[ActiveEffect, ...] = ()
     inactive_effects: tuple[InactiveEffect, ...] = ()
     dropped: tuple[tuple[Site, str], ...] = ()
+    losses: LossDecision | None = None
     _sensors: dict[str, Sensor] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property

@@ -229,8 +229,9 @@ class Sensor:
     divergence_mrad
         Full divergence angle at 1/e^2, across and along the elevation, in milliradians. Used by effects only.
     rated_range_m, rated_reflectivity
-        A target of this reflectivity (0 to 1) is still detected at this range at normal incidence. Used by effects
-        only.
+        A target of this reflectivity (0 to 1) is still detected at this range at normal incidence.
+    softness, dropout
+        Losses of returns from vehicles, see :mod:`egvs.sensors.return_model`.
     range_sigma_m
         Standard deviation of a measured range. Used only by point clouds with traffic.
     azimuth_deg
@@ -239,6 +240,8 @@ class Sensor:
         Angles of each beam, instead of rings (there are none then).
     assumed
         Which values are assumed, not the maker's.
+    rated_source
+        Document that the rated range is from, and what is assumed of it; empty for a user's sensor.
     """
 
     name: str
@@ -251,10 +254,13 @@ class Sensor:
     divergence_mrad: tuple[float, float] = _DEFAULTS["divergence_mrad"].default
     rated_range_m: float | None = _DEFAULTS["rated_range_m"].default
     rated_reflectivity: float = _DEFAULTS["rated_reflectivity"].default
+    softness: float = _DEFAULTS["softness"].default
+    dropout: float = _DEFAULTS["dropout"].default
     range_sigma_m: float = _DEFAULTS["range_sigma_m"].default
     azimuth_deg: tuple[float, float] | None = None
     table: BeamTable | None = None
     assumed: str = ""
+    rated_source: str = ""
 
     @property
     def channels(self) -> int:
@@ -361,6 +367,7 @@ class CatalogueEntry(SensorConfig):
 
     source: str = Field(min_length=1, description="The maker's document, or another source of the values")
     assumed: str = Field("", description="Which values the source does not state")
+    rated_source: str = Field("", description="Where the rated range is from, and what is assumed of it")
 
 
 @cache
@@ -374,7 +381,8 @@ def catalogue_entries() -> dict[str, CatalogueEntry]:
 def catalogue_digest(name: str) -> str:
     """Return the hash of an entry's beams and optics; the range noise is left out, since empty scans have none."""
     entry = catalogue_entries()[name]
-    return files.hash_json(entry.model_dump(mode="json", exclude={"source", "assumed", "range_sigma_m"}))
+    left_out = {"source", "assumed", "rated_source", "range_sigma_m"}
+    return files.hash_json(entry.model_dump(mode="json", exclude=left_out))
 
 
 class _Catalogue(Mapping[str, Sensor]):
@@ -387,7 +395,7 @@ class _Catalogue(Mapping[str, Sensor]):
         if name not in self._sensors:
             entry = catalogue_entries()[name]
             sensor = _sensor_from_config(name, entry, entry.source, Path)
-            self._sensors[name] = replace(sensor, assumed=entry.assumed)
+            self._sensors[name] = replace(sensor, assumed=entry.assumed, rated_source=entry.rated_source)
         return self._sensors[name]
 
     def __iter__(self) -> Iterator[str]:

@@ -15,7 +15,7 @@ from egvs.core.wording import list_first
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
-from egvs.stages import height_checks, scene_checks, traffic_checks
+from egvs.stages import height_checks, scene_checks, scene_inputs, traffic_checks
 from egvs.stages import inputs as stage_inputs
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.inputs import CheckInputs, Inputs
@@ -279,7 +279,8 @@ def run(
     Returns
     -------
     dict
-        Number of ``sites`` (those that are scanned), ``solids`` and ``lanes`` that were checked; warnings.
+        Number of ``sites`` (those that are scanned), ``solids`` and ``lanes`` that were checked; ``losses``: for which
+        sensors losses of returns are simulated; warnings.
 
     Raises
     ------
@@ -289,12 +290,12 @@ def run(
     report = check_inputs(context.inputs, scene_report(context))
     if report.errors:
         raise DiagnosticsError(report.errors, report.warnings)
-    return {
-        "sites": report.sites,
-        "solids": report.solids,
-        "lanes": report.lanes,
-        WARNINGS_KEY: [finding.to_json() for finding in report.warnings],
-    }
+    summary: Summary = {"sites": report.sites, "solids": report.solids, "lanes": report.lanes}
+    losses = scene_inputs.scenario_losses(context.scenario, context.inputs.candidates)
+    if losses is not None and losses.notes:
+        summary["losses"] = list(losses.notes)
+    summary[WARNINGS_KEY] = [finding.to_json() for finding in report.warnings]
+    return summary
 
 
 STAGE = Stage(

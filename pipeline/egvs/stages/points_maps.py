@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from egvs.core.grid import Grid
+from egvs.effects.returns import ReturnProbability
 from egvs.scoring.points_map import TARGETS, PointsMap, TargetPositions
-from egvs.scoring.targets import detection_probability
 from egvs.scoring.visibility import Beams
 from egvs.stages.base import StageContext
 
@@ -33,6 +33,6 @@ def points_maps(
     """Yield the map of each target from each of some named scans, with the name."""
     positions = tuple(positions)
     for name, beams in scans:
-        probability = detection_probability(context.scene, beams.sensor)
+        probability = ReturnProbability.of(context.scene, beams.sensor)
         for positions_of_target in positions:
             yield name, positions_of_target.points_map(beams, probability)

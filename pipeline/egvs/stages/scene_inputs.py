@@ -6,13 +6,18 @@ and score stages that can change a result.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from egvs.core.errors import InputError
 from egvs.effects import registry
+from egvs.effects.base import Effect
 from egvs.scenario.model import Scenario
 from egvs.sensors import site_feasibility, sites
+from egvs.sensors.return_model import LossDecision, decide_losses
 from egvs.sensors.scene import InactiveEffect, Scene
+from egvs.sensors.sensor import scenario_sensor
 from egvs.sensors.site_feasibility import SiteSelection
 from egvs.sensors.sites import Site
 from egvs.traffic import sumo_folder
@@ -74,15 +79,36 @@ def _check_kept_sites(scenario: Scenario, selection: SiteSelection) -> None:
 
 
 def with_effects(plain: Scene) -> Scene:
-    """Add the effects on beams and clouds that the scenario names and that can change a result."""
-    if not plain.scenario.effects.named:
-        return plain
-    active = []
+    """Add the effects on beams and clouds that can change a result: those of the scenario, and losses of returns."""
+    active: list[Effect[Any]] = []
     inactive = []
+    candidates = (*plain.sites, *(site for site, _ in plain.dropped))
+    losses = scenario_losses(plain.scenario, candidates)
+    if losses is not None and losses.acting:
+        active.append(registry.make_losses(losses.acting))
     for effect in registry.scenario_effects(plain.scenario, "scan", "score", "clouds"):
         reason = effect.why_idle(plain)
         if reason is None:
             active.append(effect)
         elif reason:
             inactive.append(InactiveEffect(effect.NAME, effect.STAGE, reason))
-    return replace(plain, effects=tuple(active), inactive_effects=tuple(inactive))
+    return replace(plain, effects=tuple(active), inactive_effects=tuple(inactive), losses=losses)
+
+
+def with_losses_of_all(scene: Scene) -> Scene:
+    """Return the scene with losses of all sensors with a rated range, for comparisons of sensors.
+
+    It is returned as it is where the scenario decides on losses.
+    """
+    if scene.losses is None:
+        return scene
+    others = tuple(effect for effect in scene.effects if effect.NAME != registry.LOSSES)
+    return replace(scene, effects=(registry.make_losses(None), *others))
+
+
+def scenario_losses(scenario: Scenario, candidates: Sequence[Site]) -> LossDecision | None:
+    """Return which sensors of all candidate sites need losses of returns; None where the scenario decides."""
+    if scenario.effects.range_limit is not None:
+        return None
+    sensors = {site.sensor: scenario_sensor(site.sensor, scenario, f"site {site.name}") for site in candidates}
+    return decide_losses(candidates, sensors, scenario.roi.box)

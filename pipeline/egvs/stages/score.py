@@ -24,15 +24,16 @@ from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
-from egvs.scenario.score_config import SCORES_IN_UNITS
+from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED, SCORES_IN_UNITS
 from egvs.scoring import score_table, standard_errors, zones
 from egvs.scoring.score_table import ScoreTable
+from egvs.scoring.target_scores import group_score
 from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.blocked_sites import warn_blocked_sites
 from egvs.stages.scene_dependencies import scan_dependencies, sensor_digests, sensor_settings
-from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring
+from egvs.stages.site_scoring import NOTICED_BOUNDS, BeamAudit, ScoredSite, SiteScoring
 from egvs.world import clearances, geolocation
 
 MIN_PERIOD_LOSS = 0.01
@@ -108,7 +109,8 @@ def run(
     sites = _write_sites(context, inputs, scoring, sites)
     scores = scoring.score_table(sites)
     metadata = _metadata(context, inputs, scoring, sites)
-    _write_scores(context, sites, scores, metadata)
+    _write_scores(context, scoring, sites, scores, metadata)
+    _write_levels(context, scoring, scores, metadata)
     _write_zones(context, scoring, sites, metadata)
     config = context.scenario.score
     by_period = context.folder.scores_by_period
@@ -151,7 +153,11 @@ def _metadata(
 
 
 def _write_scores(
-    context: StageContext, sites: Sequence[ScoredSite], scores: ScoreTable, metadata: dict[str, Any]
+    context: StageContext,
+    scoring: SiteScoring,
+    sites: Sequence[ScoredSite],
+    scores: ScoreTable,
+    metadata: dict[str, Any],
 ) -> None:
     """Write ``scores.parquet``."""
     config = context.scenario.score
@@ -174,6 +180,9 @@ def _write_scores(
             optional[name] = column.values
         if egvs.estimate is not None:
             optional[f"{name}_se"] = column.se
+    if scoring.targets is not None and scoring.targets.levels:
+        for name in NOTICED_BOUNDS:
+            optional[name] = scores.column(group_score(name, readers.ALL_USERS)).values
     if egvs.estimate is not None:
         optional["egvs_bias"] = egvs.estimate.bias
         optional["beats_next"] = ranking.beats_next
@@ -185,6 +194,33 @@ def _write_scores(
     user_columns = _user_columns(context)
     with parquet.artefact_writer(context.folder.scores, "scores", tuple(optional), extra=user_columns) as file:
         file.write(columns | optional | user_columns)
+        file.describe(metadata)
+
+
+def _write_levels(context: StageContext, scoring: SiteScoring, scores: ScoreTable, metadata: dict[str, Any]) -> None:
+    """Write ``levels.parquet`` if what detectors find is a score of the run; remove that of an earlier run if not."""
+    if scoring.targets is None or not scoring.targets.levels:
+        context.folder.levels.unlink(missing_ok=True)
+        return
+    levels = scoring.targets.levels
+    observations = [np.count_nonzero(members * scoring.targets.weight) for members in levels.values()]
+    columns: dict[str, Any] = {
+        "site": np.repeat(np.array(scores.sites, dtype=object), len(levels)),
+        "road_users": list(levels) * len(scores.sites),
+        "observations": observations * len(scores.sites),
+    }
+    errors = []
+    for name in (DEFAULT_SCORE, NOTICED, *NOTICED_BOUNDS):
+        by_group = []
+        for group in levels:
+            is_score_of_run = group == readers.ALL_USERS and name not in NOTICED_BOUNDS
+            by_group.append(scores.column(name if is_score_of_run else group_score(name, group)))
+        columns[name] = np.column_stack([column.values for column in by_group]).ravel()
+        if name not in NOTICED_BOUNDS and scores.groups.get(score_table.MIX):
+            errors.append(f"{name}_se")
+            columns[errors[-1]] = np.column_stack([column.se for column in by_group]).ravel()
+    with parquet.artefact_writer(context.folder.levels, "levels", tuple(errors)) as file:
+        file.write(columns)
         file.describe(metadata)
 
 
@@ -247,6 +283,9 @@ def _summary(
             summary["zones"] = readers.describe_worst_zones(best[0], worst)
     if scoring.zones is not None and (without_results := scoring.zones.describe_for_pedestrians()):
         summary["zones_for_pedestrians"] = without_results
+    losses = context.scene.losses
+    if losses is not None and losses.acting:
+        summary["losses"] = losses.to_json()
     skipped = context.scene.skipped("score")
     if skipped:
         summary["skipped"] = skipped

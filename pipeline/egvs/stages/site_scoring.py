@@ -8,9 +8,10 @@ of the stages before. What is large (hits in voxels, blind spots) is written whi
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,26 +20,34 @@ from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
 from egvs.artefacts.parquet import ArtefactWriter
+from egvs.artefacts.readers import ALL_USERS
 from egvs.artefacts.tpog import PeriodBlocks, Tpog, read_periods, read_tpog
 from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.threads import map_ordered
+from egvs.effects.returns import ReturnProbability
 from egvs.kernels import occupancy, traversal
 from egvs.scenario.model import SCENARIO_FILE
-from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED
 from egvs.scoring.blindspots import SpotVisibility, SpotWriter, VehicleSpots, open_spot_writer
 from egvs.scoring.egvs import EntropyField
+from egvs.scoring.noticed import group_members, noticed_bounds, noticed_errors, noticed_pools
 from egvs.scoring.road_locations import RoadLocations
 from egvs.scoring.score_table import MIX, ScoreTable, SiteScores
 from egvs.scoring.scorer import PeriodTpog, Scorer, SiteScore
-from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, detector_groups
-from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, SiteTargetScores, expected_by_detector
+from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, curve_groups, detector_groups
+from egvs.scoring.target_scores import (
+    DETECTORS,
+    TARGET_SCORES,
+    SiteTargetScores,
+    expected_by_detector,
+    group_score,
+)
 from egvs.scoring.targets import (
     FrameGroups,
     TargetRecord,
     VisibleTargets,
-    detection_probability,
     recorded_frames,
     target_weights,
     visible_targets,
@@ -61,6 +70,8 @@ if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
     from egvs.scoring.zone_results import ZoneUsers
+NOTICED_BOUNDS = ("noticed_low", "noticed_high")
+"""Scores in the table: what people notice if nothing, and if everything outside the measured data was noticed."""
 
 _ROI_HINT = "Check that the region of interest contains the road."
 
@@ -172,14 +183,36 @@ class TargetScorer:
 
     def visible(self, beams: Beams) -> VisibleTargets:
         """Return what an empty scan sees of each vehicle."""
-        return visible_targets(self.record, beams, detection_probability(self._scene, beams.sensor))
+        return visible_targets(self.record, beams, ReturnProbability.of(self._scene, beams.sensor))
 
-    @property
-    def score_groups(self) -> dict[str, tuple[BlockGroups, ...]]:
-        """Score -> its detectors, which are left out after the groups of frames; empty without standard errors."""
-        if self._groups is None or not detector_groups(len(self.detectors)):
+    @cached_property
+    def levels(self) -> dict[str, FloatArray]:
+        """Weight of each vehicle-frame in the levels of the run, (n,) float64, by the group of road users.
+
+        All of them together come first. Empty unless the share that detectors find is computed.
+        """
+        if DEFAULT_SCORE not in self._names or self.is_empty:
             return {}
-        return {DEFAULT_SCORE: detector_groups(len(self.detectors))}
+        levels = {ALL_USERS: np.ones(len(self.record))}
+        for group, are_members in group_members(self.record).items():
+            if math.fsum(self.weight[are_members]) > 0.0:
+                levels[group] = are_members.astype(np.float64)
+        return levels
+
+    @cached_property
+    def score_groups(self) -> dict[str, tuple[BlockGroups, ...]]:
+        """Score -> its detectors or the values of its curves, which come after the groups of frames.
+
+        Empty without standard errors.
+        """
+        if self._groups is None:
+            return {}
+        further: dict[str, tuple[BlockGroups, ...]] = {
+            DEFAULT_SCORE: detector_groups(len(self.detectors)),
+            NOTICED: curve_groups(noticed_pools()),
+        }
+        of_groups = {group_score(score, group): further[score] for score in further for group in self.levels}
+        return further | of_groups
 
     def weights_by_period(self) -> dict[str, FloatArray]:
         """Return the weight of each vehicle-frame in each period alone, (n,) float64; nothing without periods."""
@@ -191,18 +224,24 @@ class TargetScorer:
 
     def scores(self, visible: VisibleTargets) -> SiteTargetScores:
         """Return the requested scores of what a site sees, and where it misses vehicles."""
-        found = None
+        by_detector = None
         values: dict[str, FloatArray] = {}
         for name in self._names:
             if name == DEFAULT_SCORE:
-                found = expected_by_detector(visible, self.detectors)
-                values[name] = found.mean(axis=0)
+                by_detector = expected_by_detector(visible, self.detectors)
+                values[name] = by_detector.mean(axis=0)
             else:
                 values[name] = TARGET_SCORES[name](visible, self.detectors)
-        scores = {name: self._means(vehicle_values) for name, vehicle_values in values.items()}
-        if found is not None and self.score_groups:
-            by_detector = np.array([weighted_mean(chances, self.weight) for chances in found])
-            scores[DEFAULT_SCORE] = np.append(scores[DEFAULT_SCORE], means_without_each(by_detector))
+        parts: dict[str, FloatArray] = {}
+        if by_detector is not None:
+            parts[DEFAULT_SCORE] = by_detector
+        if NOTICED in values:
+            parts[NOTICED] = noticed_errors(visible)
+        scores: dict[str, FloatArray] = {}
+        for name, vehicle_values in values.items():
+            scores[name] = self._replicates(name, vehicle_values, parts)
+        scores |= self._level_scores(visible, scores, values, parts)
+
         by_period = []
         for _, rows in self._periods:
             by_period.append({name: self._period_mean(values[name], rows) for name in self._names})
@@ -214,11 +253,63 @@ class TargetScorer:
             missed = self.spots.visibility(visible.points, chances)
         return SiteTargetScores(scores, tuple(by_period), missed)
 
-    def _means(self, values: FloatArray) -> FloatArray:
-        """Mean over all vehicle-frames, then with each group of frames left out."""
+    def _level_scores(
+        self,
+        visible: VisibleTargets,
+        of_run: Mapping[str, FloatArray],
+        values: Mapping[str, FloatArray],
+        parts: Mapping[str, FloatArray],
+    ) -> dict[str, FloatArray]:
+        """Return what detectors find and people notice of each group of road users, with bounds of the latter.
+
+        ``of_run`` are the scores of all road users; other parameters are those of :meth:`_replicates`, by score.
+        """
+        scores: dict[str, FloatArray] = {}
+        bounds = dict(zip(NOTICED_BOUNDS, noticed_bounds(visible), strict=True))
+        for group, members in self.levels.items():
+            for name, bound in bounds.items():
+                scores[group_score(name, group)] = np.array([weighted_mean(bound, self.weight * members)])
+            if group == ALL_USERS:
+                continue
+            for score in (DEFAULT_SCORE, NOTICED):
+                of_group = of_run[score] if members.all() else self._replicates(score, values[score], parts, members)
+                scores[group_score(score, group)] = of_group
+        return scores
+
+    def _replicates(
+        self,
+        name: str,
+        values: FloatArray,
+        parts: Mapping[str, FloatArray],
+        members: FloatArray | None = None,
+    ) -> FloatArray:
+        """Mean of a score over all vehicle-frames, then with each group of frames, and each further group, left out.
+
+        Parameters
+        ----------
+        name
+            Name of the score.
+        values
+            Its value of each vehicle-frame, (n,) float64.
+        parts
+            Values by each detector, or changes by each value of curves, (p, n) float64, by score.
+        members
+            Further weight of each vehicle-frame, (n,) float64.
+        """
+        weight, configured = self.weight, self._configured_weight
+        if members is not None:
+            weight = weight * members
+            configured = members if configured is None else configured * members
         if self._groups is None:
-            return np.array([weighted_mean(values, self.weight)])
-        return self._groups.means(values, self._configured_weight)
+            return np.array([weighted_mean(values, weight)])
+        means = self._groups.means(values, configured)
+        if not self.score_groups.get(name):
+            return means
+        # most curves have no road user: sums of zeros cost as much as others
+        of_parts = np.array([weighted_mean(part, weight) if part.any() else 0.0 for part in parts[name]])
+        if name == DEFAULT_SCORE:
+            return np.append(means, means_without_each(of_parts))
+        return np.append(means, means[0] + of_parts)
 
     def _period_mean(self, values: FloatArray, rows: slice) -> float:
         weight = None if self._configured_weight is None else self._configured_weight[rows]
@@ -360,7 +451,7 @@ class SiteScoring:
         """What a scan sees of the road users of the zones: ``visible``, unless there are people without a weight."""
         if len(zones.record) == len(visible.record):
             return visible
-        return visible_targets(zones.record, beams, detection_probability(self.context.scene, beams.sensor))
+        return visible_targets(zones.record, beams, ReturnProbability.of(self.context.scene, beams.sensor))
 
     def score_table(self, sites: Iterable[ScoredSite]) -> ScoreTable:
         """Return the scores of sites as one table."""

@@ -382,6 +382,8 @@ def _effect_status(name: str, scene: Scene, trials: EffectTrials | None) -> Effe
     if issubclass(kind, Traffic) and kind.AUTO_ENABLED:
         is_on, why = kind(kind.Model()).acts(scene.scenario)
         return _status(kind, "on" if is_on else "off", why)
+    if name == registry.LOSSES and name not in named:
+        return _losses_status(kind, scene)
     if name not in named:
         return _unnamed_effect_status(kind, scene, trials)
     effect = kind(named[name])
@@ -397,6 +399,18 @@ def _effect_status(name: str, scene: Scene, trials: EffectTrials | None) -> Effe
     return _status(
         kind, "on", "set in the scenario, with " + ", ".join(f"{key} = {value}" for key, value in parameters.items())
     )
+
+
+def _losses_status(kind: type[Effect[Any]], scene: Scene) -> EffectStatus:
+    """Say for which sensors losses of returns are on, and why."""
+    losses = scene.losses
+    if losses is None:
+        return _status(kind, "off", "effects.range_limit = false")
+    acting = [effect for effect in scene.effects if isinstance(effect, kind)]
+    why = list(losses.notes)
+    if losses.negligible:
+        why.append(losses.negligible_note)
+    return _status(kind, "on" if acting else "off", "; ".join([*why, *(effect.summary(scene) for effect in acting)]))
 
 
 def _unnamed_effect_status(kind: type[Effect[Any]], scene: Scene, trials: EffectTrials | None) -> EffectStatus:

@@ -29,9 +29,11 @@ from egvs.results.ranking import RankedSite
 from egvs.results.sensors import ScoreDifference
 from egvs.runs.run_context import open_folder
 from egvs.runs.stage_registry import recorded_digests
+from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scoring.score_table import ScoreColumn
 from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty
+from egvs.sensors.return_model import REFLECTIVITY_INTERVAL
 from egvs.stages.site_scoring import SiteScoring
 
 
@@ -187,10 +189,50 @@ def read_replicates(folder: Path, sites: Mapping[str, RankedSite]) -> SiteReplic
     return SiteReplicates(names, column.replicates, column.groups)
 
 
-def _score_again(folder: Path, sites: Mapping[str, RankedSite]) -> tuple[ScoreColumn, tuple[str, ...]]:
+def interval_changes(folder: Path, sites: Mapping[str, RankedSite]) -> dict[str, float] | None:
+    """Return by how much scores change from the lowest to the highest reflectivity that the evidence allows.
+
+    Parameters
+    ----------
+    folder
+        The run folder.
+    sites
+        The sites by name, with their recorded scores.
+
+    Returns
+    -------
+    dict or None
+        Change of the score that ranks, by site; 0 without losses. None where scores cannot be computed again, or the
+        scenario sets a reflectivity.
+    """
+    changes = dict.fromkeys(sites, 0.0)
+    low, high = REFLECTIVITY_INTERVAL
+    try:
+        record = RunRecord.read(folder)
+        config = EffectsConfig.from_dict(record.scenario.get("effects", {})).range_limit
+        if config and config.reflectivity is not None:
+            return None
+        sensors = {site.sensor for site in sites.values()}
+        if not config:
+            sensors = set(record.stages["score"].summary.get("losses", {}).get("on", ()))
+        affected = {name: site for name, site in sites.items() if site.sensor in sensors}
+        if not affected:
+            return changes
+        column, names = _score_again(folder, affected, reflectivity=high)
+        lowest, _ = _score_again(folder, affected, reflectivity=low)
+    except InputError:
+        return None
+    differences = (column.values - lowest.values).tolist()
+    return changes | dict(zip(names, differences, strict=True))
+
+
+def _score_again(
+    folder: Path, sites: Mapping[str, RankedSite], reflectivity: float | None = None
+) -> tuple[ScoreColumn, tuple[str, ...]]:
     """Return the score that ranks, of the sites of a run, and their names in the order of the run.
 
-    InputError if the scenario folder does not exist, or an artefact was changed.
+    With the losses that road users of another ``reflectivity`` have, if one is given. InputError if the scenario folder
+    does not exist, or an artefact was changed.
     """
     record = RunRecord.read(folder)
     record_path = RunFolder(folder).run_record
@@ -200,6 +242,10 @@ def _score_again(folder: Path, sites: Mapping[str, RankedSite]) -> tuple[ScoreCo
     scenario = scenario_from_dict(record.scenario, source, str(record_path))
     score = scenario.score.model_copy(update={"blindspots": False, "others": (), "keep_visibility": ()})
     scenario = scenario.model_copy(update={"score": score})
+    if reflectivity is not None:
+        effects = scenario.effects.model_dump()
+        effects["range_limit"] = effects.get("range_limit", {}) | {"reflectivity": reflectivity}
+        scenario = scenario.model_copy(update={"effects": EffectsConfig.from_dict(effects)})
 
     context = open_folder(scenario, folder, recorded=recorded_digests(record))
     context.digests(RunFolder.tpog.name, RunFolder.trajectories.name)  # refuses files that were changed

@@ -14,7 +14,7 @@ compared otherwise. :mod:`egvs.studies.paired_errors` has the standard errors of
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -39,7 +39,7 @@ from egvs.scenario.score_config import CostsConfig
 from egvs.scenario.settings import flatten_settings
 from egvs.sensors.sensor import check_sensor_names
 from egvs.statistics.ranks import best_sites, rank_agreement, regret
-from egvs.studies.paired_errors import ScoreDifferences, SiteOfRun
+from egvs.studies.paired_errors import ScoreDifferences, SiteOfRun, interval_changes
 
 SCORES = RunFolder.scores.name
 
@@ -79,6 +79,8 @@ class ComparedRun:
         Settings by full key, and sha256 of the files that its scores depend on.
     costs
         Costs of its mounts.
+    unrated
+        Its sensors without a rated range, whose losses of returns are unknown.
     """
 
     label: str
@@ -87,6 +89,7 @@ class ComparedRun:
     settings: Mapping[str, Any]
     files: Mapping[str, str]
     costs: CostsConfig = field(default_factory=CostsConfig)
+    unrated: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         best = self.ranking.best[0]
@@ -96,10 +99,14 @@ class ComparedRun:
         )
 
     @property
-    def has_range_limit(self) -> bool:
-        """Whether the effect ``range_limit`` was enabled."""
+    def has_losses(self) -> bool:
+        """Whether losses of returns were simulated, or could not change the result."""
+        if self.settings.get(_RANGE_LIMIT) is False:
+            return False
         keys = [key for key, value in self.settings.items() if value is not None]
-        return any(key == _RANGE_LIMIT or key.startswith(f"{_RANGE_LIMIT}.") for key in keys)
+        if any(key == _RANGE_LIMIT or key.startswith(f"{_RANGE_LIMIT}.") for key in keys):
+            return True
+        return not self.unrated
 
     @cached_property
     def sites(self) -> Mapping[str, RankedSite]:
@@ -340,7 +347,15 @@ def _read_run(folder: Path, label: str, cost_overrides: Sequence[str]) -> Compar
         if name not in ("check", "report"):
             input_files |= {file: digest for file, digest in stage.files.items() if file not in artefacts}
     costs = costs_from_dict(record.scenario, cost_overrides, str(RunFolder(folder).run_record))
-    return ComparedRun(label, folder, Ranking.read(path), settings, input_files, costs)
+    ranking = Ranking.read(path)
+    unrated = _unrated_sensors(record.scenario, {site.sensor for site in ranking.sites})
+    return ComparedRun(label, folder, ranking, settings, input_files, costs, unrated)
+
+
+def _unrated_sensors(scenario: Mapping[str, Any], names: Collection[str]) -> tuple[str, ...]:
+    """Return the user-defined sensors of a recorded scenario that have no rated range."""
+    custom = scenario.get("sensors", {})
+    return tuple(sorted(name for name in names if name in custom and custom[name].get("rated_range_m") is None))
 
 
 def _without_request(placement: Mapping[str, Any]) -> dict[str, Any]:
@@ -465,13 +480,34 @@ def _sensor_mounts(runs: Sequence[ComparedRun]) -> tuple[SensorMount, ...]:
 def _compare_sensors(
     runs: Sequence[ComparedRun], mounts: Sequence[SensorMount], differences: ScoreDifferences
 ) -> SensorComparison | None:
+    """Compare sensors; errors contain the interval of the losses of returns.
+
+    A reflectivity anywhere in the interval, with equal probability, differs from the default, its low end, by
+    1 / sqrt(3) of its width in the root mean square, and the score in proportion.
+    """
     folders = {run.label: run.folder for run in runs}
+    changes = _interval_changes(folders, mounts)
 
     def difference(mount: SensorMount, other: SensorMount) -> ScoreDifference:
         first, second = (SiteOfRun(folders[one.run], one.site) for one in (mount, other))
-        return differences.between(first, second)
+        change = changes.get((mount.run, mount.site.site), 0.0) - changes.get((other.run, other.site.site), 0.0)
+        return differences.between(first, second).widened(abs(change) / math.sqrt(3.0))
 
-    return SensorComparison.of(mounts, difference)
+    comparison = SensorComparison.of(mounts, difference)
+    has_interval = len(changes) == len({(mount.run, mount.site.site) for mount in mounts})
+    return None if comparison is None else replace(comparison, has_loss_interval=has_interval)
+
+
+def _interval_changes(folders: Mapping[str, Path], mounts: Sequence[SensorMount]) -> dict[tuple[str, str], float]:
+    """Return the change of the score over the interval of the reflectivity, by run and site, where it is known."""
+    sites: dict[str, dict[str, RankedSite]] = {}
+    for mount in mounts:
+        sites.setdefault(mount.run, {})[mount.site.site] = mount.site
+    changes: dict[tuple[str, str], float] = {}
+    for label, sites_of_run in sites.items():
+        for name, change in (interval_changes(folders[label], sites_of_run) or {}).items():
+            changes[label, name] = change
+    return changes
 
 
 def _are_comparable(a: ComparedRun, b: ComparedRun) -> bool:

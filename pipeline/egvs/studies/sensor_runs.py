@@ -8,8 +8,9 @@ the scenario as it is.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from egvs.core.errors import InputError
 from egvs.core.wording import by_number
@@ -18,6 +19,7 @@ from egvs.runs import run
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.model import Scenario
 from egvs.scenario.settings import format_overrides
+from egvs.sensors.return_model import decide_losses
 from egvs.sensors.sensor import CATALOGUE, check_sensor_names, scenario_sensor
 from egvs.sensors.sites import Site, candidate_sites
 
@@ -93,13 +95,28 @@ def prepare_runs(path: Path, sensors: str, overrides: Sequence[str] = ()) -> Sen
     runs = []
     for name in names:
         scenario, folder = base, run.default_folder(base)
+        changes = _losses_of(name, base, sites)
         if present != {name}:
-            scenario = source.load_variant((*overrides, *format_overrides({"sites.replace_sensor": name})))
+            changes["sites.replace_sensor"] = name
+        if changes:
+            scenario = source.load_variant((*overrides, *format_overrides(changes)))
             folder = run.default_folder(scenario)
         elif not overrides:
             folder = source.folder(base)
         runs.append(SensorRun(name, scenario, folder))
     return SensorRuns(tuple(runs), sensors == ALL_SENSORS, tuple(_notes(runs, sites)))
+
+
+def _losses_of(name: str, scenario: Scenario, sites: Sequence[Site]) -> dict[str, Any]:
+    """Return the setting with which losses of returns act for a sensor that the scenario would not need them for.
+
+    Sensors are compared with the losses of all; those of a sensor without a rated range are unknown.
+    """
+    if scenario.effects.range_limit is not None:
+        return {}
+    replaced = [replace(site, sensor=name) for site in sites]
+    losses = decide_losses(replaced, {name: scenario_sensor(name, scenario, OPTION)}, scenario.roi.box)
+    return {"effects.range_limit": {}} if losses.negligible else {}
 
 
 def run_sensors(
@@ -165,7 +182,14 @@ def _check_simulated(sites: Sequence[Site]) -> None:
 
 
 def _notes(runs: Sequence[SensorRun], sites: Sequence[Site]) -> Iterator[str]:
-    """Yield a note if sensors that do not see the full circle are at sites that all look east."""
+    """Yield notes on sensors without a rated range, and on partial views from sites that all look east."""
+    for sensor_run in runs:
+        sensor = scenario_sensor(sensor_run.sensor, sensor_run.scenario, OPTION)
+        if sensor.rated_range_m is None and sensor_run.scenario.effects.range_limit is None:
+            yield (
+                f"{sensor.name} has no rated range: its losses of returns are not simulated, and it looks better than "
+                f"it is. Enter rated_range_m and rated_reflectivity under [sensors.{sensor.name}]"
+            )
     if any(site.pose.yaw_deg for site in sites):
         return
     partial = []

@@ -362,8 +362,16 @@ def _measure_settings(scenario: Scenario, values: SettingValues) -> Iterator[Set
     for name in scenario.effects.named:
         yield Setting(f"{WITHOUT_PREFIX}{name}", MEASURES, "effect", (), without=name)
     if values.unnamed_effects:
+        if registry.LOSSES not in scenario.effects.named and _has_losses(scenario):
+            yield Setting(f"{WITHOUT_PREFIX}{registry.LOSSES}", MEASURES, "effect", (), without=registry.LOSSES)
         for name in _acting_effects(scenario):
             yield Setting(f"{WITH_PREFIX}{name}", MEASURES, "effect", (f"effects.{name}={{}}",))
+
+
+def _has_losses(scenario: Scenario) -> bool:
+    """Whether losses of returns act although the scenario does not name them."""
+    losses = build_scene(scenario).losses
+    return losses is not None and bool(losses.acting)
 
 
 def _acting_effects(scenario: Scenario) -> Iterator[str]:
@@ -372,6 +380,8 @@ def _acting_effects(scenario: Scenario) -> Iterator[str]:
     for name in registry.effect_names():
         if name in scenario.effects.named or name in AUTO_ENABLED or registry.required_parameters(name):
             continue
+        if name == registry.LOSSES and scenario.effects.range_limit is not False:
+            continue  # it acts where it changes a result
         scene = scene or build_scene(scenario)
         kind = registry.load_effect_class(name)
         if issubclass(kind, Echo):

@@ -154,6 +154,19 @@ def test_overrides_have_a_folder_of_their_own(
     assert "complete" in run_egvs("runs", f"runs/{city.name}@gamma=2/junctions")[1]
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+def test_losses_act_as_in_single_runs(city: City, tmp_path: Path) -> None:
+    rated = ["sensors.small.rated_range_m=30", "sensors.small.rated_reflectivity=0.1"]
+    scores = []
+    for setting in ([], ["effects.range_limit={}"], ["effects.range_limit=false"]):
+        ran = city_run.run_city(city, tmp_path / f"out{len(scores)}", CityRunOptions(overrides=[*rated, *setting]))
+        folder = results.junction_run_folder(ran.out, "west")
+        scores.append(egvs.read_scores(folder / "scores.parquet")["egvs"].to_pylist())
+    assert scores[0] == scores[1]
+    assert all(a < b for a, b in zip(scores[0], scores[2], strict=True))
+
+
 def test_invalid_override_writes_nothing(city: City, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     before = sorted(city.folder.rglob("*"))

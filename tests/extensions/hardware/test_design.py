@@ -297,3 +297,18 @@ def test_search_starts_at_the_elevations_of_the_sensor() -> None:
     assert start_elevations(own, 3, (-30.0, 0.0)) == (-20.0, -5.0, -1.0)
     assert start_elevations(own, 5, (-30.0, 0.0)) == (-20.0, -15.25, -10.5, -5.75, -1.0)
     assert start_elevations(own, 3, (-10.0, 0.0)) == (-10.0, -5.5, -1.0)
+
+
+def test_designs_are_scored_with_losses(tmp_path: Path) -> None:
+    """Also where the rule would leave them out: 13 m to the lane, and 600 m rated at 10 %."""
+    path = one_lane(tmp_path)
+    for rated_m, number in ((15, 0), (600, 1)):
+        rated = [f"sensors.coarse.rated_range_m={rated_m}", "sensors.coarse.rated_reflectivity=0.1"]
+        rated.append("sensors.small.rated_range_m=50")  # the sensor of the sites, which named losses act on
+        scores = []
+        for setting in ([], ["effects.range_limit={}"], ["effects.range_limit=false"]):
+            scenario = egvs.load(path, [*rated, *setting])
+            request = DesignRequest(pole="pole_a", sensors=("coarse",), evaluations=20)
+            out = tmp_path / f"out{number}{len(scores)}"
+            scores.append(design_sensor(scenario, request, out, jobs=1).catalogue[0].score)
+        assert scores[0] == scores[1] < scores[2]

@@ -40,6 +40,7 @@ from egvs.core.errors import InputError, choose_one
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.hardware.design_request import ALL_SENSORS, DesignRequest
 from egvs.extensions.hardware.files import SENSOR_DESIGN, design_digest
 from egvs.placement.refinement import Axis, BoxEnds, Freedom, minimise
@@ -49,13 +50,12 @@ from egvs.runs import run, stage_registry
 from egvs.runs.command_results import add_to_report
 from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
-from egvs.scenario.sensor_config import SensorConfig
+from egvs.scenario.sensor_config import OPTICS_KEYS, SensorConfig
 from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty, detector_groups
 from egvs.scoring.target_scores import expected_by_detector
 from egvs.scoring.targets import (
     FrameGroups,
     TargetRecord,
-    detection_probability,
     recorded_frames,
     target_weights,
     visible_targets,
@@ -70,6 +70,7 @@ from egvs.sensors.sensor import CATALOGUE, Sensor, check_sensor_names
 from egvs.sensors.site_feasibility import ground_height_m
 from egvs.sensors.sites import Pose, Site
 from egvs.stages.base import StageContext
+from egvs.stages.scene_inputs import with_losses_of_all
 from egvs.statistics.blocks import group_sizes, means_without_each
 
 STAGES = ("check", "statics", "traffic", "tpog")
@@ -300,7 +301,7 @@ class _Designer:
 
     def __init__(self, context: StageContext, request: DesignRequest) -> None:
         self._context = context
-        self._scene = context.scene
+        self._scene = with_losses_of_all(context.scene)  # it compares sensors
         self._scanner = Scanner(self._scene)
         self._sites = _sites_at(self._scene.sites, request.pole)
         self.ground_m = 0.0
@@ -417,7 +418,7 @@ class _Designer:
 
     def _chances(self, sensor: Sensor, pose: Pose, half: _Half) -> FloatArray | None:
         """Return the probability that each detector finds each vehicle of a half, (d, n); None as :meth:`_values`."""
-        probability = detection_probability(self._scene, sensor)  # InputError if an effect lacks a value of the sensor
+        probability = ReturnProbability.of(self._scene, sensor)  # InputError if an effect lacks a value of the sensor
         try:
             beams = Beams.of(self._scanner.scan(pose, sensor))
         except InputError:  # the only reasons: in a solid, below the ground, out of reach
@@ -663,7 +664,7 @@ def sensor_table(sensor: Sensor) -> dict[str, Any]:
     if sensor.azimuth_deg is not None:
         table["azimuth_deg"] = list(sensor.azimuth_deg)
     table["range_m"] = sensor.range_m
-    for key in ("wavelength_nm", "divergence_mrad", "rated_range_m", "rated_reflectivity", "range_sigma_m"):
+    for key in OPTICS_KEYS:
         value = getattr(sensor, key)
         if value != SensorConfig.model_fields[key].default:
             table[key] = list(value) if isinstance(value, tuple) else value

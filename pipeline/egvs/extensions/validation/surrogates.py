@@ -38,6 +38,7 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
 from egvs.effects import registry
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.validation.target_points import TargetPoints, list_target_points
 from egvs.kernels.hits import max_free_probability
 from egvs.runs import stage_keys
@@ -574,7 +575,7 @@ class _PreparedScenario:
         def score_site(scan_and_returned: tuple[SiteScan, NDArray[np.bool_]]) -> list[_NumberedRow]:
             scan, returned = scan_and_returned
             site = scan.site.name
-            probability = targets.detection_probability(scene, scan.beams.sensor)
+            probability = ReturnProbability.of(scene, scan.beams.sensor)
 
             def count_hits(beams: Beams) -> tuple[Hits, int]:
                 return hit_counter.borrowed_hits(beams).copy(), hit_counter.unit

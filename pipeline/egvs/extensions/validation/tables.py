@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from egvs.cli.console import NARROW, Column, console, print_sentences, print_table
 from egvs.core.wording import format_percent, number_of
@@ -16,7 +16,7 @@ from egvs.extensions.validation.detector_runs import DetectionListener
 from egvs.extensions.validation.remaining_time import RemainingTime
 from egvs.extensions.validation.results import main_measure
 from egvs.results.labels import SCORE_LABELS
-from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.scenario.score_config import DEFAULT_SCORE, RankingScore
 
 if TYPE_CHECKING:
     from egvs.core.resource_usage import ResourceUsage
@@ -55,7 +55,7 @@ def print_scores(entries: Iterable[ScoreEntry]) -> None:
         Column("source", _format_source, "left", wrap=True),
     ]
     print_table(columns, entries, file_width=_FILE_WIDTH)
-    others = ", ".join(name for name in SCORE_LABELS if name != DEFAULT_SCORE)
+    others = ", ".join(name for name in get_args(RankingScore) if name != DEFAULT_SCORE)
     console(_FILE_WIDTH, soft_wrap=False).print(
         f"[score] rank_by chooses the score that ranks sites: {DEFAULT_SCORE} (recommended), {others}"
     )

@@ -13,7 +13,7 @@ import numpy as np
 
 from egvs.core.grid import FloatArray, IntArray
 from egvs.kernels import vehicle_visibility
-from egvs.scoring.targets import MAX_HITS, TargetRecord, sort_beams
+from egvs.scoring.targets import MAX_HITS, NO_LOSSES, TargetRecord, sort_beams
 from egvs.scoring.visibility import Beams
 
 
@@ -63,7 +63,7 @@ def list_target_points(
     frame, nearest_m, alone = 0, ordered.length_m.copy(), np.zeros(count)
     while frame < len(record.numbers):
         frame, filled = vehicle_visibility.first_hits(
-            frame, sensor_m, size_m, all_boxes, tuple(ordered), nearest_m, (alone, *unused), hits
+            frame, sensor_m, size_m, all_boxes, tuple(ordered), nearest_m, tuple(NO_LOSSES), (alone, *unused), hits
         )
         box, beam, range_m, along_m, across_m = (column[:filled] for column in hits)
         is_point = ordered.weight[beam] > 0.0

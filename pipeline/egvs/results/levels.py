@@ -1,0 +1,123 @@
+"""Levels: what share of vehicles people notice from a site, and both levels of each group of road users.
+
+A share that rests on what was measured is printed as a number with its error. If more than :data:`MAX_SHARE_OUTSIDE`
+of the vehicles are outside the data of the curves (:mod:`egvs.scoring.noticed`), it is printed as a range: from the
+share if none of these was noticed to the share if all of them were, in steps of 5 %.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from egvs.artefacts import parquet
+from egvs.artefacts.readers import ALL_USERS
+from egvs.core.wording import format_percent
+from egvs.results.labels import SCORE_LABELS
+from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED
+
+MAX_SHARE_OUTSIDE = 0.1
+"""With more vehicles outside the data, a share is printed as a range."""
+
+MIN_NOTICED_LEAD = 0.01
+"""Shares noticed that differ by less are taken as equal."""
+
+_RANGE_STEP = 0.05
+
+
+@dataclass(frozen=True)
+class NoticedShare:
+    """The share of vehicles that people notice.
+
+    Attributes
+    ----------
+    value
+        The share.
+    se
+        Its standard error; None if unknown.
+    low, high
+        The share if none, and if all of the vehicles outside the data of the curves were noticed.
+
+    Examples
+    --------
+    >>> NoticedShare(0.897, 0.017, 0.897, 0.897).text
+    '90 ± 2 %'
+    >>> NoticedShare(0.897, 0.017, 0.72, 0.93).text
+    '70 to 95 %'
+    """
+
+    value: float
+    se: float | None
+    low: float
+    high: float
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether enough of the vehicles are inside the data of the curves for a number with an error."""
+        return self.high - self.low <= MAX_SHARE_OUTSIDE
+
+    @property
+    def text(self) -> str:
+        """The share with its error, or a range, in per cent."""
+        if not self.is_measured:
+            return self.cell
+        return SCORE_LABELS[NOTICED].with_error(self.value, math.nan if self.se is None else self.se)
+
+    @property
+    def cell(self) -> str:
+        """The share, or a range, in per cent: a cell of a table."""
+        if self.is_measured:
+            return SCORE_LABELS[NOTICED].value(self.value)
+        low = math.floor(round(self.low / _RANGE_STEP, 6)) * _RANGE_STEP
+        high = min(1.0, math.ceil(round(self.high / _RANGE_STEP, 6)) * _RANGE_STEP)
+        return f"{100.0 * low:.0f} to {format_percent(high, 0)}"
+
+
+@dataclass(frozen=True)
+class GroupLevel:
+    """What detectors find and people notice of one group of road users.
+
+    Attributes
+    ----------
+    road_users
+        Name of the group.
+    observations
+        Number of road users, counted once in each frame.
+    found, found_se
+        Share that detectors should find, and its standard error; None if that is unknown.
+    noticed
+        Share that people notice.
+    """
+
+    road_users: str
+    observations: int
+    found: float
+    found_se: float | None
+    noticed: NoticedShare
+
+    @property
+    def found_text(self) -> str:
+        """The share that detectors should find, with its error."""
+        return SCORE_LABELS[DEFAULT_SCORE].with_error(self.found, math.nan if self.found_se is None else self.found_se)
+
+
+GROUPS_NOTE = (
+    "Detectors: models that were trained on cars; they say nothing about vans, trucks and buses. People: curves "
+    "measured for each group."
+)
+"""What the levels of groups mean."""
+
+
+def read_levels(path: Path, site: str) -> tuple[GroupLevel, ...]:
+    """Return the groups of one site in ``levels.parquet``, without all together; empty if there is no such file."""
+    if not path.exists():
+        return ()
+    levels = []
+    for row in parquet.read_artefact(path, "levels")[0].to_pylist():
+        if row["site"] != site or row["road_users"] == ALL_USERS:
+            continue
+        noticed = NoticedShare(row[NOTICED], row.get(f"{NOTICED}_se"), row["noticed_low"], row["noticed_high"])
+        found = row[DEFAULT_SCORE], row.get(f"{DEFAULT_SCORE}_se")
+        levels.append(GroupLevel(row["road_users"], row["observations"], *found, noticed))
+    return tuple(levels)
