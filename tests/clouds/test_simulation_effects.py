@@ -8,6 +8,7 @@ import pytest
 
 from egvs.clouds.simulation import CloudSimulator, sweep_rng
 from egvs.effects.base import Detect
+from egvs.sensors.return_model import ReturnModel
 from egvs.sensors.sites import Pose
 from tests.clouds.cloud_scenes import build_scene, frame_of, make_sensor, random_frame
 from tests.conftest import BUILDING, collection, feature
@@ -196,3 +197,26 @@ def test_vehicle_draws_are_even_and_fixed_by_name_and_seed():
     draws = vehicle_draws(names, 1)
     assert draws[7] == vehicle_draws([names[7]], 1)[0] != vehicle_draws([names[7]], 2)[0]
     assert abs((draws < 0.12).mean() - 0.12) < 4 * math.sqrt(0.12 * 0.88 / 2000)
+
+
+def test_points_on_vehicles_are_those_that_scores_expect(mini):
+    """Windows return less and the rest of a body more than the formula of scores; the sum is the same."""
+    rated = ("effects.range_limit={rated_range_m=40, rated_reflectivity=0.1}",)
+    scene, sensor = build_scene(mini, *rated), make_sensor(**{**FINE, "azimuth_step_deg": 0.25})
+    simulator = CloudSimulator(scene, POSE, sensor, "here")
+    frame = random_frame(np.random.default_rng(2), (20.0, 5.0, 0.0))
+    hits = simulator.first_hits(frame)
+    model = ReturnModel(40.0, 0.1)
+    on_body = hits.owner >= 0
+    by_score = model.probability(hits.range_m[on_body])
+    assert 0.2 < by_score.mean() < 0.9
+
+    is_glass = simulator._bodies.surfaces[hits.triangle[on_body]] == "glass"
+    kept = np.zeros(len(is_glass))
+    draws = 60
+    rows = np.flatnonzero(on_body)
+    for number in range(draws):
+        kept += np.isin(rows, simulator.sweep(frame, sweep_rng(1, "here", number)).sweep.beam)
+    spread = math.sqrt(draws * (by_score * (1 - by_score)).sum())
+    assert abs(kept.sum() - draws * by_score.sum()) < 4 * spread + 0.02 * draws * by_score.sum()
+    assert kept[is_glass].sum() < draws * by_score[is_glass].sum() - 4 * math.sqrt(draws * is_glass.sum()) / 2

@@ -359,7 +359,8 @@ def test_returns_without_vehicles_are_the_empty_scan(simulated: Session) -> None
     ground = result.returns_m[np.abs(result.returns_m[:, 2]) < 0.1]
     empty = simulated.returns_m(site)
     assert (result.owner == -1).all()
-    assert len(result.returns_m) >= len(empty)  # those that cannot meet the region too
+    # those that cannot meet the region, too; a grazed road far away loses returns
+    assert 0.8 * len(empty) < len(result.returns_m) < simulated.scene.sensor(site.sensor).beams
     assert len(ground) > 1000
 
 

@@ -421,11 +421,12 @@ def _weigh_box_hits(b, box, directions, runs, nearest_m, t_m, parabola, per_m, s
 
 @_kernel
 def _miss_slices(box, directions, rows, nearest_m, parabola, per_m, misses):  # type: ignore[no-untyped-def]
-    """Multiply the misses (2, SLICES) of a box by the probability that the returns of the beams ``rows`` are lost."""
+    """Fill the misses (2, SLICES) of a box: the probability that no return of the beams ``rows`` is from a slice."""
     c0, c1, c2, middle = parabola
     ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
     bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
     x, y, z = directions[0], directions[1], directions[2]
+    misses[:] = 1.0
     by_length, by_width = misses[0], misses[1]
     for n in rows:
         t = nearest_m[n]
@@ -445,6 +446,7 @@ def _thin_box_hits(b, box, directions, rows, nearest_m, weight, loss, sums):  # 
     total, sides, slices, low, high = sums
     by_range, is_weighted = shares[share_row[b]], weight.shape[0] > 0
     by_length, by_width = misses[miss_row[b], 0], misses[miss_row[b], 1]
+    by_length[:], by_width[:] = 1.0, 1.0
     hit_weight, on_sides, parts = 0.0, 0.0, np.uint64(0)
     a_low, a_high, b_low, b_high = np.inf, -np.inf, np.inf, -np.inf
     for n in rows:
@@ -536,8 +538,8 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, loss, sums, hits):  # 
         ranges from 0, interpolated between them, a row for each reflectivity, (k, m) float64, m > 1; no row where all
         are detected. ``share_row``: the row of each box, (b,) int64. ``per_m``: steps in a metre. ``miss_row``: the row
         of ``misses`` of each box, (b,) int64; filled with -1 for boxes with :data:`MANY_POINTS` expected points, whose
-        extent is that of all beams. ``misses``, 1 at first, is multiplied by the probability that no return is from a
-        slice: of the length, and of the width, (n, 2, SLICES) float32.
+        extent is that of all beams. ``misses`` is filled: the probability that no return is from a slice of the length,
+        and of the width, (n, 2, SLICES) float32.
     sums
         Filled: ``alone``, (b,) float64, the weight of all beams that meet the box, occluded or not; 0 at first. And,
         for ``listed`` boxes, unless ``hits`` are listed, of the beams that meet it first: ``total``, (b,) float64,

@@ -326,7 +326,7 @@ class SliceMisses(NamedTuple):
     rows
         The vehicle-frames, (k,) int64. Points on any other extend as far as the beams that meet it.
     misses
-        Of the slices of the length, and of the width, of all vehicle-frames, (n, 2, 64) float32; 1 for the others.
+        Of slices of the length and the width of all vehicle-frames, (n, 2, 64) float32; undefined for the others.
     """
 
     rows: IntArray
@@ -548,7 +548,7 @@ class Losses(NamedTuple):
         count = len(record.all_boxes.values)
         share_row, miss_row = np.zeros(count, dtype=np.int64), np.full(count, -1, dtype=np.int64)
         share_row[record.row], miss_row[record.row] = row, np.arange(len(record))
-        misses = np.ones((len(record), 2, vehicle_visibility.SLICES), dtype=np.float32)
+        misses = np.empty((len(record), 2, vehicle_visibility.SLICES), dtype=np.float32)
         return cls(np.array(shares).reshape(len(shares), -1), share_row, _STEPS_PER_M, miss_row, misses)
 
     def filled(self, record: TargetRecord, slices: NDArray[np.uint64]) -> SliceMisses:
