@@ -81,10 +81,10 @@ def site_view(fit: SensorFit, background: EmptyScanFit) -> SiteView:
 
 
 def sweep_of(range_m: FloatArray, fit: SensorFit) -> Sweep:
-    """Return a measured sweep as detectors receive it."""
+    """Return a measured sweep as detectors receive it; its intensity is unknown."""
     points = empty_scan.points_of(range_m, fit.angles)[fit.angles.ascending].transpose(1, 0, 2).reshape(-1, 3)
     beam = np.flatnonzero(np.isfinite(points[:, 0]))
-    columns = np.column_stack([points[beam], np.ones(len(beam))]).astype(np.float32)
+    columns = np.column_stack([points[beam], np.full(len(beam), np.nan)]).astype(np.float32)
     return Sweep(columns, beam.astype(np.uint32))
 
 

@@ -326,6 +326,22 @@ def beams(folder: Path) -> None:
     (made / "beams.csv").write_text(BEAMS)
 
 
+def metadata(folder: Path) -> None:
+    """A sensor with the metadata of an Ouster."""
+    rings = "elevations_deg = [-15, 5]\nchannels = 8\nazimuth_step_deg = 1.0\n"
+    made = mini(folder, (rings, 'beams = "metadata.json"\n'))
+    beams = {"beam_altitude_angles": [5.0, -5.5, -15.0], "beam_azimuth_angles": [1.5, 0.0, -1.5]}
+    text = {"beam_intrinsics": beams, "lidar_data_format": {"columns_per_frame": 512, "column_window": [0, 511]}}
+    (made / "metadata.json").write_text(json.dumps(text))
+
+
+def angles(folder: Path) -> None:
+    """A sensor with the angle correction of a Hesai."""
+    rings = "elevations_deg = [-15, 5]\nchannels = 8\nazimuth_step_deg = 1.0\n"
+    made = mini(folder, (rings, 'beams = "angles.csv"\nazimuth_step_deg = 1.0\n'))
+    (made / "angles.csv").write_text("Laser id,Elevation,Azimuth\n1,5.0,1.5\n2,-5.5,0.0\n3,-15.0,-1.5\n")
+
+
 def _points() -> np.ndarray:
     """Returns of a scan from (10, 12, 3): the ground along rings."""
     azimuth = np.deg2rad(np.arange(0, 360, 3))

@@ -173,6 +173,8 @@ _ALL = (
     _input("sites.csv", "sites.csv", bases.plain, meaning.rows),
     _input("sites.geojson", "sites.geojson", bases.sites, meaning.text_json),
     _input("beams.csv", "beams.csv", bases.beams, meaning.rows),
+    _input("metadata.json", "metadata.json", bases.metadata, meaning.text_json),
+    _input("angles.csv", "angles.csv", bases.angles, meaning.rows),
     _input("scan.csv", "points.csv", bases.measured("points.csv"), meaning.rows),
     _input("scan.las", "points.las", bases.measured("points.las"), meaning.bytes_themselves),
     _input("scan.laz", "points.laz", bases.measured("points.laz"), meaning.bytes_themselves),

@@ -69,6 +69,7 @@ ALONG = ("sites.along=[{line_m=[[2, -9], [38, -9]], spacing_m=9, heights_m=[3]}]
 NO_HEIGHT = ("sites.file='places.csv'", "sites.heights_m=[3]")
 TABLE = ("sensors.small={beams='beams.csv', range_m=90}",)
 EVEN = ("kind='even'", "samples=99", "azimuth_deg=[-60, 60]", "elevation_deg=[-20, 5]")
+DIRECTIONS = ("kind='file'", "samples=99", "file='directions.csv'")
 TURNING = "sensors.small.pattern.turns=[3.1, -5.3]"
 ROSETTE = ("kind='rosette'", "samples=99", "azimuth_deg=[-60, 60]", "elevation_deg=[-20, 5]", "turns=[3.1, -5.3]")
 
@@ -236,6 +237,7 @@ KEYS: dict[str, Change] = {
     "sensors.*.azimuth_deg": Change("[-60, 60]"),
     "sensors.*.beams": Change("'other_beams.csv'", TABLE),
     "sensors.*.pattern.kind": Change("'rosette'", pattern(EVEN), together_with=TURNING),
+    "sensors.*.pattern.file": Change("'other_directions.csv'", pattern(DIRECTIONS)),
     "sensors.*.pattern.samples": Change("50", pattern(EVEN)),
     "sensors.*.pattern.azimuth_deg": Change("[-60, 50]", pattern(EVEN)),
     "sensors.*.pattern.elevation_deg": Change("[-20, 0]", pattern(EVEN)),
@@ -397,6 +399,8 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "other_zones.csv": "zone,x_m,y_m\ncrossing,20,-8\ncrossing,30,-8\ncrossing,30,8\n",
         "beams.csv": "elevation_deg,azimuth_deg\n0,0\n-5,90\n",
         "other_beams.csv": "elevation_deg,azimuth_deg\n0,0\n-5,80\n",
+        "directions.csv": "elevation_deg,azimuth_deg,dwell_s\n0,0,1\n-5,90,1\n",
+        "other_directions.csv": "elevation_deg,azimuth_deg,dwell_s\n0,0,1\n-5,90,2\n",
     }
     kinds = SCENARIO[SCENARIO.index("[[traffic.kinds]]") : SCENARIO.index("[statics]")]
     without_kinds = SCENARIO.replace(kinds, "").replace('fcd = "fcd.csv"', 'network = "streets.net.xml"')

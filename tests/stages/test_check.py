@@ -413,7 +413,8 @@ def test_warns_of_repeated_beams(street: Path) -> None:
     assert told == {
         "repeated beams": [
             "[beams.csv: 1 of 4 beams have the same direction as an earlier one (beam 2 = beam 0) and count twice]"
-        ]
+        ],
+        "few beams": ["[beams.csv: own has 4 beams in a turn or frame; a LiDAR has thousands]"],
     }
 
 

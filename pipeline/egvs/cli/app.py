@@ -546,18 +546,28 @@ def figure(
 def sensors(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME...]", help="Print all that is known of these sensors, with the sources."),
+        typer.Argument(
+            metavar="[NAME|FILE]...",
+            help="Print all that is known of these sensors, with the sources; of a file of beams (.csv, .json), what is"
+            " read.",
+        ),
     ] = None,
 ) -> None:
-    """List the sensor catalogue; with names, print the details and sources of these sensors."""
+    """List the sensor catalogue; with names or files of beams, print the details of these sensors."""
     from egvs.cli import run_tables
+    from egvs.sensors.beam_files import is_beam_file, read_beam_file
     from egvs.sensors.sensor import CATALOGUE, check_sensor_names
 
     if not names:
         run_tables.print_sensors(CATALOGUE.values())
         return
-    check_sensor_names(names, (), "NAME")
-    run_tables.print_sensor_details([CATALOGUE[name] for name in names])
+    files = {name: read_beam_file(Path(name)) for name in names if is_beam_file(name)}
+    check_sensor_names((name for name in names if name not in files), (), "NAME")
+    for name in names:
+        if name in files:
+            run_tables.print_beam_file(Path(name), files[name])
+        else:
+            run_tables.print_sensor_details([CATALOGUE[name]])
 
 
 @app.command(cls=cli_options.NewCommand)

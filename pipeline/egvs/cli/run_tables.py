@@ -36,6 +36,7 @@ from egvs.sensors.return_model import NEGLIGIBLE_LOSS, ReturnModel
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
+    from egvs.sensors.beam_files import BeamFile
     from egvs.sensors.sensor import Sensor
     from egvs.stages.check import CheckReport
     from egvs.studies.effect_study import EffectChange, EffectCost, EffectStatus
@@ -365,7 +366,7 @@ def print_sensor_details(sensors: Iterable[Sensor]) -> None:
         divergence_mrad = " x ".join(f"{angle:g}" for angle in sensor.divergence_mrad)
         lines = [
             sensor.name,
-            f"  beams: {sensor.beams} of one turn or frame; {rings}{step}",
+            f"  beams: {sensor.pulses} of one turn or frame; {rings}{step}",
             f"  view: azimuth {_format_azimuths(sensor)} deg, elevation {_format_elevations(sensor)} deg",
             f"  range: {sensor.range_m:g} m; rated: {_format_rating(sensor, ' m')}",
             f"  laser: {sensor.wavelength_nm:g} nm, divergence {divergence_mrad} mrad, range noise "
@@ -384,6 +385,59 @@ def print_sensor_details(sensors: Iterable[Sensor]) -> None:
         if sensor.assumed:
             lines.append(f"  assumed: {sensor.assumed}")
         print_sentences(lines)
+
+
+def print_beam_file(path: Path, file: BeamFile) -> None:
+    """Print what was read of a file of beams, and how a scenario uses it."""
+    from egvs.sensors.beam_files import BeamTable
+    from egvs.sensors.sensor import FEW_BEAMS, FEW_BEAMS_HINT
+
+    beams = file.beams
+    if isinstance(beams, BeamTable):
+        elevations, azimuths = beams.elevation_deg.tolist(), beams.azimuth_deg.tolist()
+        lines = [
+            f"{path}: {file.kind}",
+            f"  {len(beams):,} single beams, one per row; azimuths {_format_span(azimuths)}",
+        ]
+        count: int | None = len(beams)
+    else:
+        elevations, azimuths = beams.elevations_deg, beams.azimuth_offsets_deg
+        lines = [
+            f"{path}: {file.kind}",
+            f"  {len(elevations)} rings; azimuth offsets {_format_span(azimuths)}, counter-clockwise",
+        ]
+        count = None if beams.azimuths is None else beams.azimuths * len(elevations)
+        if beams.azimuths is None:
+            lines.append("  columns: not stated; set azimuth_step_deg")
+        else:
+            view = "the full circle"
+            if beams.azimuth_deg is not None:
+                view = f"azimuths from {beams.azimuth_deg[0]:.4g} to {beams.azimuth_deg[1]:.4g} deg"
+            lines.append(f"  columns: {beams.azimuths:,}, {view}; {count:,} beams")
+        if beams.axis_distance_m:
+            lines.append(f"  beams leave {1000 * beams.axis_distance_m:.4g} mm beside the axis (not simulated)")
+        if beams.vertical_offsets_m:
+            offsets_mm = [1000 * offset_m for offset_m in beams.vertical_offsets_m]
+            lines.append(f"  vertical offsets {_format_span(offsets_mm, 'mm')} (not simulated)")
+    lines.append(f"  elevations {_format_span(elevations)}: {_first_values(elevations)}")
+    keys = f'beams = "{path.name}", range_m = METRES'
+    if file.dwell_s is not None:
+        keys = f'range_m = METRES, pattern = {{kind = "file", file = "{path.name}", samples = PULSES OF A FRAME}}'
+    if not isinstance(beams, BeamTable) and beams.azimuths is None:
+        keys += ", azimuth_step_deg = DEGREES"
+    lines.append(f"  in a scenario: [sensors.NAME] with {keys}")
+    if count is not None and count < FEW_BEAMS:
+        lines.append(f"  warning: {count:,} beams in a turn or frame; a LiDAR has thousands. {FEW_BEAMS_HINT}")
+    print_sentences(lines)
+
+
+def _format_span(values: Sequence[float], unit: str = "deg") -> str:
+    return f"{min(values):.4g} to {max(values):.4g} {unit}"
+
+
+def _first_values(values: Sequence[float], count: int = 8) -> str:
+    text = ", ".join(f"{value:g}" for value in values[:count])
+    return text if len(values) <= count else f"{text}, ..."
 
 
 def _format_view(sensor: Sensor) -> str:

@@ -27,8 +27,8 @@ class Sweep:
     Attributes
     ----------
     points
-        x, y, z in metres in the sensor's frame (x ahead, y left, z up, as it is mounted), and intensity 0 to 1; (n, 4)
-        float32.
+        x, y, z in metres in the sensor's frame (x ahead, y left, z up, as it is mounted), and intensity 0 to 1, NaN
+        where it is unknown; (n, 4) float32.
     beam
         Index of each point's beam in the sensor's table, (n,) uint32, ascending.
     """

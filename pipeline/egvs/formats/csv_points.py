@@ -1,12 +1,13 @@
 """Read CSV files of points: a header row with ``x_m, y_m, z_m`` in any order, then one return per row.
 
-Further columns are ignored. World frame, metres.
+Of further columns, one that is asked for by name is read. World frame, metres.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import pyarrow.csv
 from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.formats.point_clouds import NUMBER_HINT, parse_float, stack_xyz
+from egvs.formats.point_clouds import NUMBER_HINT, parse_float, stack_columns
 
 _COLUMNS = ("x_m", "y_m", "z_m")
 _MAX_COLUMNS = 10_000
@@ -25,23 +26,38 @@ _HINT = "Write a header row with x_m, y_m, z_m, then one return per row."
 
 def read(path: Path, where: str) -> FloatArray:
     """Return all points, (n, 3) float64; InputError at ``where`` for a damaged file."""
+    names, body = _split(path, where)
+    return _read_columns(where, body, names, _COLUMNS)
+
+
+def read_field(path: Path, where: str, names: Sequence[str]) -> FloatArray | None:
+    """Return the first of these columns that the file has once, (n,) float64; None if it has none of them."""
+    columns, body = _split(path, where)
+    known = [name for name in names if columns.count(name) == 1]
+    return _read_columns(where, body, columns, known[:1])[:, 0] if known else None
+
+
+def _split(path: Path, where: str) -> tuple[list[str], bytes]:
+    """Return the names of the columns, and the rows."""
     with open_input(path) as file:
-        data = file.read().removeprefix(b"\xef\xbb\xbf")
-    head, _, body = data.partition(b"\n")
-    names = _column_names(where, head)
+        head, _, body = file.read().removeprefix(b"\xef\xbb\xbf").partition(b"\n")
+    return _column_names(where, head), body
+
+
+def _read_columns(where: str, body: bytes, names: list[str], read: Sequence[str]) -> FloatArray:
     if not body.strip():
-        return np.empty((0, 3))
+        return np.empty((0, len(read)))
 
     # Columns are read by number, because further ones may share a name or have none.
-    xyz = [str(names.index(name)) for name in _COLUMNS]
+    numbers = [str(names.index(name)) for name in read]
     options = pa.csv.ReadOptions(column_names=[str(i) for i in range(len(names))])
-    types = dict.fromkeys(xyz, pa.float64())
-    convert = pa.csv.ConvertOptions(column_types=types, include_columns=xyz, null_values=[])
+    types = dict.fromkeys(numbers, pa.float64())
+    convert = pa.csv.ConvertOptions(column_types=types, include_columns=numbers, null_values=[])
     try:
         table = pa.csv.read_csv(pa.py_buffer(body), options, convert_options=convert)
     except pa.ArrowInvalid as error:
-        raise _row_error(where, body, names, str(error)) from None
-    return stack_xyz([table[name].to_numpy() for name in xyz])
+        raise _row_error(where, body, names, read, str(error)) from None
+    return stack_columns([table[number].to_numpy() for number in numbers])
 
 
 def _column_names(where: str, head: bytes) -> list[str]:
@@ -59,7 +75,7 @@ def _column_names(where: str, head: bytes) -> list[str]:
     return names
 
 
-def _row_error(where: str, body: bytes, names: list[str], error: str) -> InputError:
+def _row_error(where: str, body: bytes, names: list[str], read: Sequence[str], error: str) -> InputError:
     """Return the error for the first row that is wrong, which Arrow's message does not name."""
     rows = csv.reader(io.StringIO(body.decode("latin-1"), newline=""))
     try:
@@ -68,7 +84,7 @@ def _row_error(where: str, body: bytes, names: list[str], error: str) -> InputEr
             if row and len(row) != len(names):
                 return InputError(row_where, f"expected {len(names)} values, one per column, got {len(row)}", _HINT)
             for name, text in zip(names, row, strict=bool(row)):
-                if name in _COLUMNS and parse_float(text) is None:
+                if name in read and parse_float(text) is None:
                     return InputError(f"{row_where}: {name}", f"expected a number, got {text!r}", NUMBER_HINT)
     except csv.Error:
         pass  # Arrow's message describes it

@@ -19,7 +19,7 @@ from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE, translate_errors
-from egvs.formats.point_clouds import PointChunk, stack_xyz
+from egvs.formats.point_clouds import PointChunk, stack_columns
 from egvs.formats.reader_process import Block, read_blocks, serve
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def _chunks(path: Path) -> Iterator[FloatArray]:
     quiet = np.errstate(over="ignore", invalid="ignore")  # points that a scale makes infinite are dropped
     with quiet, path.open("rb") as file, laspy.open(file, read_evlrs=False, laz_backend=backend) as las:
         for chunk in las.chunk_iterator(_CHUNK):
-            yield stack_xyz([chunk.x, chunk.y, chunk.z])
+            yield stack_columns([chunk.x, chunk.y, chunk.z])
 
 
 def crs_of(path: Path, where: str) -> str | None:

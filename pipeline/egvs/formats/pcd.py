@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,21 +64,34 @@ def read(path: Path, where: str) -> FloatArray:
     with open_input(path) as file:
         data = file.read()
     header = _read_header(where, data)
-    layout = _layout(where, header.words)
     viewpoint = _viewpoint(where, header.words.get("VIEWPOINT"))
-    match header.words["DATA"]:
-        case ["ascii"]:
-            points = layout.from_text(data[header.data_start :], header.lines + 1)
-        case ["binary"]:
-            points = layout.from_records(memoryview(data)[header.data_start :])
-        case ["binary_compressed"]:
-            points = layout.from_blocks(_unpack(where, data[header.data_start :], layout.n * layout.size))
-        case other:
-            problem = f"DATA: expected ascii, binary or binary_compressed, got {' '.join(other)[:60]!r}"
-            raise InputError(where, problem, "Convert the file to one of these.")
+    points = _read_fields(where, data, header, AXES)
     if viewpoint == _IDENTITY:
         return points
     return _to_world(points, viewpoint)
+
+
+def read_field(path: Path, where: str, names: Sequence[str]) -> FloatArray | None:
+    """Return the first of these fields that the file has, (n,) float64; None if it has none of them."""
+    data = path.read_bytes()
+    header = _read_header(where, data)
+    known = [name for name in names if name in header.words.get("FIELDS", [])]
+    return _read_fields(where, data, header, known[:1])[:, 0] if known else None
+
+
+def _read_fields(where: str, data: bytes, header: _Header, names: Sequence[str]) -> FloatArray:
+    """Return fields of all points as they are in the file, (n, fields) float64."""
+    layout = _layout(where, header.words, names)
+    match header.words["DATA"]:
+        case ["ascii"]:
+            return layout.from_text(data[header.data_start :], header.lines + 1)
+        case ["binary"]:
+            return layout.from_records(memoryview(data)[header.data_start :])
+        case ["binary_compressed"]:
+            return layout.from_blocks(_unpack(where, data[header.data_start :], layout.n * layout.size))
+        case other:
+            problem = f"DATA: expected ascii, binary or binary_compressed, got {' '.join(other)[:60]!r}"
+            raise InputError(where, problem, "Convert the file to one of these.")
 
 
 def stream(path: Path, where: str) -> Iterator[PointChunk]:
@@ -130,7 +143,7 @@ def _read_header(where: str, data: bytes) -> _Header:
     return _Header(words, start, lines)
 
 
-def _layout(where: str, header: dict[str, list[str]]) -> RecordLayout:
+def _layout(where: str, header: dict[str, list[str]], read: Sequence[str]) -> RecordLayout:
     for key in ("FIELDS", "SIZE", "TYPE"):
         if key not in header:
             raise InputError(where, f"the PCD header has no {key} line", _HEADER_HINT)
@@ -149,7 +162,7 @@ def _layout(where: str, header: dict[str, list[str]]) -> RecordLayout:
     counts = []
     for name, count in zip(names, words["COUNT"], strict=True):
         counts.append(parse_count(where, f"COUNT of {name}", [count]))
-    return RecordLayout.from_fields(where, _point_count(where, header), names, formats, counts)
+    return RecordLayout.from_fields(where, _point_count(where, header), names, formats, counts, read)
 
 
 def _point_count(where: str, header: dict[str, list[str]]) -> int:

@@ -1,6 +1,7 @@
 """Read PLY files (Stanford polygon format) in ascii and in binary, little or big endian; write them as binary.
 
-Everything except the vertices' x, y and z is ignored, including faces. World frame, metres.
+Of the vertices, x, y and z are read, and a property that is asked for by name; the rest is ignored, including faces.
+World frame, metres.
 
 Not trimesh: it rounds text to the header's float and accepts text with fewer or more points than the header declares.
 Not plyfile, for the same reasons.
@@ -8,7 +9,7 @@ Not plyfile, for the same reasons.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -57,6 +58,20 @@ def read(path: Path, where: str) -> FloatArray:
     with open_input(path) as file:
         data = file.read()
     header = _read_header(where, data)
+    return _read_properties(where, data, header, AXES)
+
+
+def read_field(path: Path, where: str, names: Sequence[str]) -> FloatArray | None:
+    """Return the first of these properties that the vertices have, (n,) float64; None if they have none of them."""
+    data = path.read_bytes()
+    header = _read_header(where, data)
+    properties = [name for element in header.elements if element.name == "vertex" for name in element.properties]
+    known = [name for name in names if name in properties]
+    return _read_properties(where, data, header, known[:1])[:, 0] if known else None
+
+
+def _read_properties(where: str, data: bytes, header: _Header, read: Sequence[str]) -> FloatArray:
+    """Return properties of all vertices, (n, properties) float64."""
     names = [element.name for element in header.elements]
     if "vertex" not in names:
         problem = f"expected an element 'vertex', got {' '.join(names) or 'none'}"
@@ -65,7 +80,8 @@ def read(path: Path, where: str) -> FloatArray:
     vertex = header.elements[at]
     is_last = at == len(names) - 1
     formats = _formats(where, vertex, header.order)
-    layout = RecordLayout.from_fields(where, vertex.n, list(vertex.properties), formats, [1] * len(formats))
+    counts = [1] * len(formats)
+    layout = RecordLayout.from_fields(where, vertex.n, list(vertex.properties), formats, counts, read)
     if header.order == "=":
         skip = sum(element.n for element in header.elements[:at])
         return layout.from_text(data[header.data_start :], header.lines + 1, skip, is_last)

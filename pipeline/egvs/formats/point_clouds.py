@@ -3,14 +3,16 @@
 Steps of :func:`read_points`: find the format by the file's suffix; read the file; drop, and count, the points that are
 NaN or infinite, which mark missing returns. Incomplete files are rejected.
 
-The module of a format has a function ``read`` and may have ``write`` and ``crs_of`` (:class:`PointFormat`). The formats
-of this program are in :mod:`egvs.formats.readers`; other packages may add theirs (``docs/extending.md``).
+The module of a format has a function ``read`` and may have ``write``, ``crs_of``, ``stream`` and ``read_field``
+(:class:`PointFormat`). The formats of this program are in :mod:`egvs.formats.readers`; other packages may add theirs
+(``docs/extending.md``).
 
 Points are in the world frame (right-handed, x east, y north, z up), metres, float64, or in the coordinate reference
 system that the file declares (:func:`point_cloud_crs`).
 
-:class:`RecordLayout` reads records of equal size, as in PCD and PLY files: x, y and z from lines of text, from binary
-records, or from blocks of one field each. Numbers in text files are read as float64 even where the header says float.
+:class:`RecordLayout` reads records of equal size, as in PCD and PLY files: some fields (by default x, y and z) from
+lines of text, from binary records, or from blocks of one field each. Numbers in text files are read as float64 even
+where the header says float.
 """
 
 from __future__ import annotations
@@ -60,6 +62,14 @@ class LocatedFormat(PointFormat, Protocol):
 
     def crs_of(self, path: Path, where: str, /) -> str | None:
         """Return the coordinate reference system of a file, in a form that PROJ knows; None if it declares none."""
+
+
+@runtime_checkable
+class FieldFormat(PointFormat, Protocol):
+    """A file format whose points may have more than coordinates."""
+
+    def read_field(self, path: Path, where: str, names: Sequence[str], /) -> FloatArray | None:
+        """Return the first of these fields that a file has, (n,) float64 in its order; None if it has none of them."""
 
 
 class PointChunk(NamedTuple):
@@ -173,6 +183,38 @@ def stream_points(path: Path, where: str) -> Iterator[PointChunk]:
         yield from point_format.stream(path, where)
 
 
+def read_field(path: Path, where: str, names: Sequence[str]) -> FloatArray | None:
+    """Return a field of all points of a file besides x, y and z.
+
+    Parameters
+    ----------
+    path
+        A file that :func:`read_points` can read.
+    where
+        The file, for messages.
+    names
+        Names of the field; the first that the file has counts.
+
+    Returns
+    -------
+    field
+        One value per point, (n,) float64 in the file's order; None if the file has no such field, or its format none
+        at all.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged.
+    """
+    where = _with_path(where, path)
+    point_format = _load_format(_find_reader(path, where))
+    if not isinstance(point_format, FieldFormat):
+        return None
+    limits.checked_size(path, limits.FILE, where)
+    with translate_errors(where, COMPLETE_FILE):
+        return point_format.read_field(path, where, names)
+
+
 def point_cloud_crs(path: Path, where: str) -> str | None:
     """Return the coordinate reference system that a point cloud declares, as WKT; None if it declares none.
 
@@ -254,7 +296,7 @@ NUMBER_HINT = "Use a number, or nan for a missing return."
 
 @dataclass(frozen=True)
 class RecordLayout:
-    """Positions of x, y and z in records of equal size.
+    """Positions of some fields, by default x, y and z, in records of equal size.
 
     Attributes
     ----------
@@ -265,7 +307,7 @@ class RecordLayout:
     values, size
         Values of a record in text, and bytes of a binary record.
     columns, offsets, formats
-        Column in text, offset in a binary record, and numpy format of x, y and z.
+        Column in text, offset in a binary record, and numpy format of each field that is read.
     """
 
     where: str
@@ -278,28 +320,35 @@ class RecordLayout:
 
     @classmethod
     def from_fields(
-        cls, where: str, n: int, names: Sequence[str], formats: Sequence[str], counts: Sequence[int]
+        cls,
+        where: str,
+        n: int,
+        names: Sequence[str],
+        formats: Sequence[str],
+        counts: Sequence[int],
+        read: Sequence[str] = AXES,
     ) -> Self:
         """Return the layout of records with fields of these names, numpy formats (with byte order) and counts.
 
-        InputError when there are no points or too many, or not exactly one field each of x, y and z.
+        InputError when there are no points or too many, or not exactly one field each of those that are ``read``.
         """
         if n == 0:
             raise InputError(where, "the header declares 0 points", "Use a file with at least one return.")
         limits.POINTS.check(where, n)
-        for axis in AXES:
-            if names.count(axis) != 1 or counts[names.index(axis)] != 1:
-                problem = f"expected one field {axis!r}, got the fields {' '.join(names) or 'none'}"
-                raise InputError(where, problem, "Write one field for each of x, y and z.")
+        for name in read:
+            if names.count(name) != 1 or counts[names.index(name)] != 1:
+                problem = f"expected one field {name!r}, got the fields {' '.join(names) or 'none'}"
+                hint = "Write one field for each of x, y and z." if name in AXES else f"Write one field {name}."
+                raise InputError(where, problem, hint)
         sizes = [np.dtype(kind).itemsize * count for kind, count in zip(formats, counts, strict=True)]
         columns = (0, *accumulate(counts))
         offsets = (0, *accumulate(sizes))
-        xyz = [names.index(axis) for axis in AXES]
-        first, start = [tuple(values[i] for i in xyz) for values in (columns, offsets)]
-        return cls(where, n, columns[-1], offsets[-1], first, start, tuple(formats[i] for i in xyz))
+        fields = [names.index(name) for name in read]
+        first, start = [tuple(values[i] for i in fields) for values in (columns, offsets)]
+        return cls(where, n, columns[-1], offsets[-1], first, start, tuple(formats[i] for i in fields))
 
     def from_text(self, text: bytes, line: int, skip: int = 0, last: bool = True) -> FloatArray:
-        """Return points from lines of text.
+        """Return the fields that are read, from lines of text.
 
         Parameters
         ----------
@@ -329,7 +378,7 @@ class RecordLayout:
         return np.ascontiguousarray(table[:, self.columns], dtype=np.float64)
 
     def from_records(self, body: memoryview, last: bool = True) -> FloatArray:
-        """Return points from binary records; only white space may follow the ``last`` ones."""
+        """Return the fields that are read from binary records; only white space may follow the ``last`` ones."""
         expected = self.n * self.size
         if len(body) < expected or (last and bytes(body[expected:]).strip()):
             problem = (
@@ -337,14 +386,15 @@ class RecordLayout:
                 f" {len(body)} bytes"
             )
             raise InputError(self.where, problem, COMPLETE_FILE)
-        kind = np.dtype({"names": AXES, "formats": self.formats, "offsets": self.offsets, "itemsize": self.size})
+        names = [str(number) for number in range(len(self.formats))]
+        kind = np.dtype({"names": names, "formats": self.formats, "offsets": self.offsets, "itemsize": self.size})
         records = np.frombuffer(body[:expected], dtype=kind)
-        return stack_xyz([records[axis] for axis in AXES])
+        return stack_columns([records[name] for name in names])
 
     def from_blocks(self, body: bytes | bytearray) -> FloatArray:
-        """Return points from binary data with one block of all values per field (PCD's binary_compressed)."""
+        """Return the fields that are read from binary data with one block per field (PCD's binary_compressed)."""
         blocks = zip(self.formats, self.offsets, strict=True)
-        return stack_xyz([np.frombuffer(body, kind, self.n, offset * self.n) for kind, offset in blocks])
+        return stack_columns([np.frombuffer(body, kind, self.n, offset * self.n) for kind, offset in blocks])
 
     def _text_error(self, rows: list[tuple[int, bytes]], error: str) -> InputError:
         """Return the error for the first line that is wrong, which numpy's message does not name."""
@@ -361,12 +411,12 @@ class RecordLayout:
         )
 
 
-def stack_xyz(columns: Sequence[NDArray[np.generic]]) -> FloatArray:
-    """Return columns x, y, z of any numeric types, (n,) each, as one (n, 3) float64."""
-    points = np.empty((len(columns[0]), 3))
+def stack_columns(columns: Sequence[NDArray[np.generic]]) -> FloatArray:
+    """Return columns of any numeric types, (n,) each, such as x, y and z, as one (n, columns) float64."""
+    points = np.empty((len(columns[0]), len(columns)))
     with np.errstate(invalid="ignore"):  # a signalling NaN marks a missing return like any other
-        for axis, column in enumerate(columns):
-            points[:, axis] = column
+        for number, column in enumerate(columns):
+            points[:, number] = column
     return points
 
 

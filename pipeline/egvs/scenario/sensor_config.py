@@ -18,6 +18,8 @@ OPTICS_KEYS = (
 """Keys of the laser and the receiver."""
 _FIELD_OF_VIEW_KEYS = ("azimuth_deg", "beams", "pattern")
 _RING_KEYS = ("channels", "azimuth_offsets_deg", "azimuth_step_deg", "azimuth_deg")
+_FILE_RING_KEYS = ("azimuth_step_deg", "azimuth_deg")
+"""They complete a file of rings; :mod:`egvs.sensors.sensor` refuses them with other files."""
 
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Azimuth = Annotated[float, Field(ge=-360, le=360)]
@@ -31,26 +33,43 @@ def _check_beams(beams: float, what: str) -> None:
 
 
 class BeamPatternConfig(StrictModel):
-    """A formula for the beams of a sensor whose scan pattern does not repeat; it models one frame."""
+    """One frame of a sensor whose scan pattern does not repeat: a formula, or a file of directions."""
 
-    kind: Literal["rosette", "even"] = Field(
-        description="'rosette': two prisms of equal deflection that rotate at different speeds; 'even': evenly spread"
+    kind: Literal["rosette", "even", "file"] = Field(
+        description="'rosette': two prisms of equal deflection that rotate at different speeds; 'even': evenly spread;"
+        " 'file': directions with dwell times, scored as expected hits over one frame"
     )
     samples: int = Field(ge=1, description="Number of beams per frame")
-    azimuth_deg: tuple[Azimuth, Azimuth] = Field(description="Lowest and highest azimuth")
-    elevation_deg: tuple[Elevation, Elevation] = Field(description="Lowest and highest elevation")
+    azimuth_deg: tuple[Azimuth, Azimuth] | None = Field(None, description="Lowest and highest azimuth, of a formula")
+    elevation_deg: tuple[Elevation, Elevation] | None = Field(
+        None, description="Lowest and highest elevation, of a formula"
+    )
+    file: str | None = Field(
+        None, description="A CSV file of directions with the columns elevation_deg, azimuth_deg, dwell_s"
+    )
     turns: tuple[Turns, Turns] | None = Field(None, description="Rotations of the prisms of a rosette per frame")
 
     @model_validator(mode="after")
     def _check_values(self) -> BeamPatternConfig:
         _check_beams(self.samples, "samples")
+        if (self.kind == "file") != (self.file is not None):
+            raise ValueError("file must be set for the kind 'file', and only for it")
         for key in ("azimuth_deg", "elevation_deg"):
-            low, high = getattr(self, key)
-            if not low < high:
-                raise ValueError(f"{key} = [{low:g}, {high:g}] is not ascending")
+            span = getattr(self, key)
+            if (span is None) != (self.kind == "file"):
+                raise ValueError(f"{key} must be set for a formula, and only for a formula")
+            if span is not None and not span[0] < span[1]:
+                raise ValueError(f"{key} = [{span[0]:g}, {span[1]:g}] is not ascending")
         if (self.kind == "rosette") != (self.turns is not None):
             raise ValueError("turns must be set for a rosette, and only for a rosette")
         return self
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what only a file has, so that formulas keep their cache keys."""
+        values: dict[str, Any] = serialize(self)
+        unused = {"azimuth_deg", "elevation_deg"} if self.kind == "file" else {"file"}
+        return {name: value for name, value in values.items() if name not in unused}
 
 
 class SensorConfig(StrictModel):
@@ -68,7 +87,9 @@ class SensorConfig(StrictModel):
         None, description="First and last azimuth of a ring, counter-clockwise from x. By default the full circle"
     )
     beams: str | None = Field(
-        None, description="Instead of rings: a CSV file of beams with the columns elevation_deg, azimuth_deg"
+        None,
+        description="A file of beams or rings: a table (CSV), an Ouster's metadata (JSON), angles of Hesai or RoboSense"
+        " (CSV)",
     )
     pattern: BeamPatternConfig | None = None
     range_m: Positive = Field(description="Maximum range")
@@ -90,6 +111,15 @@ class SensorConfig(StrictModel):
     range_sigma_m: NotNegative = Field(
         0.03, description="Standard deviation of measured ranges; used for point clouds with traffic only"
     )
+
+    @property
+    def beam_file(self) -> tuple[str, str] | None:
+        """Key and name of the file that states the beams or directions; None without a file."""
+        if self.beams is not None:
+            return "beams", self.beams
+        if self.pattern is not None and self.pattern.file is not None:
+            return "pattern.file", self.pattern.file
+        return None
 
     @property
     def optics(self) -> dict[str, Any]:
@@ -130,7 +160,10 @@ class SensorConfig(StrictModel):
             if self.azimuth_step_deg is None:
                 raise ValueError("elevations_deg needs azimuth_step_deg")
             return self
-        unused = [key for key in _RING_KEYS if getattr(self, key)]
+        if self.azimuth_deg is not None and self.azimuth_step_deg is None:
+            raise ValueError("azimuth_deg needs azimuth_step_deg")
+        completing = _FILE_RING_KEYS if sources == ["beams"] else ()
+        unused = [key for key in _RING_KEYS if getattr(self, key) and key not in completing]
         if unused:
             raise ValueError(f"no effect with {sources[0]}: {', '.join(unused)}")
         return self

@@ -1,9 +1,10 @@
 """Empty scans: scans of the static world, without traffic, from any pose.
 
 Steps for a pose: reject it where no sensor can stand (in a solid, below the ground, out of range of the region of
-interest); compute the directions of the sensor's beams; expand them into weighted sub-beams, where effects do so; cast
-them; cut them at porous surfaces. A site with a measured scan uses that scan instead. A scan leaves out the pole, mast
-or sign that carries its sensor (:mod:`egvs.world.supports`), and no other scan does.
+interest); compute the directions of the sensor's beams, and their weights if it has dwell times; expand them into
+weighted sub-beams, where effects do so; cast them; cut them at porous surfaces. A site with a measured scan uses that
+scan instead. A scan leaves out the pole, mast or sign that carries its sensor (:mod:`egvs.world.supports`), and no
+other scan does.
 
 A measured scan holds returns only. Beams that met nothing are missing from it.
 """
@@ -58,7 +59,7 @@ class Scan:
     beams
         Beams of the sensor; points of a measured scan.
     rows
-        The beams that can meet the region of interest: their ends, and weights where effects weight beams.
+        The beams that can meet the region of interest: their ends, and weights where effects or dwell times set them.
     """
 
     pose: Pose
@@ -188,7 +189,7 @@ class Scanner:
         caster = self._caster(is_site_position and not self.full_sweep, self.scene.own_supports(pose))
         cast = caster.sweep if self.full_sweep else caster.scan
         directions = self._beam_directions(sensor, pose)
-        if self._expanders:
+        if self._expanders or sensor.beam_weight is not None:
             chunks = []
             for start in range(0, len(directions), _BEAMS_PER_CHUNK):
                 chunk = directions[start : start + _BEAMS_PER_CHUNK]
@@ -198,6 +199,8 @@ class Scanner:
             rows = cast(pose.position_m, directions, sensor.range_m)
         for cut in self._cuts:
             rows = cut(rows, pose)
+        if rows.weight is None and self.scene.weights_beams:  # another sensor of the scenario has dwell times
+            rows = replace(rows, weight=np.ones(len(rows.beam)))
         return Scan(pose, sensor, sensor.beams, rows)
 
     def _caster(self, at_sites: bool, supports: tuple[int, ...]) -> Caster:
@@ -231,6 +234,8 @@ class Scanner:
         """Cast the sub-beams of some beams; ``start`` is the number of the first beam."""
         beam = np.arange(start, start + len(directions))
         weight = np.ones(len(directions))
+        if sensor.beam_weight is not None:
+            weight = sensor.beam_weight[start : start + len(directions)]
         for effect in self._expanders:
             directions, parent, share = effect.expand(directions, sensor, pose)
             beam = beam[parent]

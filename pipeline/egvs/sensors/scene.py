@@ -115,5 +115,7 @@ class Scene:
 
     @property
     def weights_beams(self) -> bool:
-        """Whether the rows of its scans are weighted shares of beams."""
-        return any(effect.STAGE == "scan" for effect in self.effects)
+        """Whether the rows of its scans are weighted: by effects, or by directions of a sensor with dwell times."""
+        patterns = (config.pattern for config in self.scenario.sensors.values())
+        has_dwell_times = any(pattern is not None and pattern.file is not None for pattern in patterns)
+        return has_dwell_times or any(effect.STAGE == "scan" for effect in self.effects)

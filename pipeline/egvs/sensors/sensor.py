@@ -2,8 +2,8 @@ r"""LiDAR sensors: beam directions, range and optics; the catalogue; beam tables
 
 A sensor is either a set of rings or a table of beams. Rings have one elevation and one azimuth offset each, a common
 azimuth step and, optionally, a limited field of view; beam ``k`` of ring ``r`` at azimuth index ``a`` is
-:math:`k = a \cdot channels + r`. The beams of a table come in the order of its rows; a table is read from a CSV file or
-computed from a scan pattern (:func:`beams_from_pattern`).
+:math:`k = a \cdot channels + r`. The beams of a table come in the order of its rows. Both are read from files
+(:mod:`egvs.sensors.beam_files`); a table is also computed from a scan pattern (:func:`beams_from_pattern`).
 
 The direction of a beam in the sensor frame (x forward, z up) is
 
@@ -22,83 +22,30 @@ the values that are assumed because the source does not state them.
 
 from __future__ import annotations
 
-import csv
 import difflib
-import hashlib
-import io
 import math
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from pydantic import Field
 
 from egvs.core import files, limits
-from egvs.core.digests import hash_input, open_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.numbers import number_or_nan, parse_decimal
 from egvs.core.special import cosdg, sindg
 from egvs.scenario.model import Scenario
 from egvs.scenario.sensor_config import BeamPatternConfig, SensorConfig
+from egvs.sensors.beam_files import BeamTable, read_beam_file, read_directions
 
-BEAM_COLUMNS = ("elevation_deg", "azimuth_deg")
-_MAX_ANGLE_DEG = {"elevation_deg": 90.0, "azimuth_deg": 360.0}
+FEW_BEAMS = 1000
+"""A LiDAR has more beams in a turn or frame; with fewer, a file of rings was probably read as one of single beams."""
+
 _GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
 _BEAM_DIGITS = 6
-_GAP_DEG = 5.0
-"""A beam table without a wider gap between azimuths covers the full circle."""
-_GAP_TOLERANCE_DEG = 1e-6
-"""Gaps whose widths differ by less are equally wide."""
-
-
-class BeamTable:
-    """Elevation and azimuth of each beam in the sensor frame, degrees; immutable and hashable.
-
-    Two tables are equal if their angles are equal.
-
-    Parameters
-    ----------
-    elevation_deg, azimuth_deg
-        One value per beam, (n,) float64 each, n > 0.
-    """
-
-    def __init__(self, elevation_deg: FloatArray, azimuth_deg: FloatArray) -> None:
-        self.elevation_deg = np.array(elevation_deg, dtype=np.float64)
-        self.azimuth_deg = np.array(azimuth_deg, dtype=np.float64)
-        self.elevation_deg.flags.writeable = False
-        self.azimuth_deg.flags.writeable = False
-        self._digest = hashlib.sha256(self.elevation_deg.tobytes() + self.azimuth_deg.tobytes()).digest()
-
-    def __len__(self) -> int:
-        return len(self.elevation_deg)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, BeamTable) and self._digest == other._digest
-
-    def __hash__(self) -> int:
-        return hash(self._digest)
-
-    @property
-    def azimuth_span_deg(self) -> tuple[float, float] | None:
-        """First and last azimuth of the smallest arc that holds all beams, counter-clockwise; None for a full circle.
-
-        The circle is full where no gap is wide, or where several gaps are equally wide, as in a coarse table of a whole
-        turn.
-        """
-        azimuths = np.unique(np.mod(self.azimuth_deg, 360.0))
-        gaps = np.diff(azimuths, append=azimuths[0] + 360.0)
-        widest = int(np.argmax(gaps))
-        n_widest = np.count_nonzero(gaps > gaps[widest] - _GAP_TOLERANCE_DEG)
-        if gaps[widest] <= _GAP_DEG or n_widest > 1:
-            return None
-        first = float(azimuths[(widest + 1) % len(azimuths)])
-        if first > 180.0:
-            first -= 360.0
-        return first, first + 360.0 - float(gaps[widest])
 
 
 def repeated_beams(table: BeamTable) -> list[tuple[int, int]]:
@@ -115,65 +62,20 @@ def repeated_beams(table: BeamTable) -> list[tuple[int, int]]:
     return [(int(beam), int(earlier[beam])) for beam in repeated]
 
 
-def read_beam_table(path: Path) -> BeamTable:
-    """Read a CSV with the columns ``elevation_deg`` and ``azimuth_deg``, one row per beam; other columns are ignored.
-
-    Raises
-    ------
-    InputError
-        Naming file, row and value.
-    """
-    return _read_cached(path, hash_input(path))
+def describe_few_beams(sensor: Sensor) -> str | None:
+    """Return a sentence if a sensor has fewer than :data:`FEW_BEAMS` beams; None otherwise."""
+    if sensor.pulses >= FEW_BEAMS:
+        return None
+    return f"{sensor.name} has {sensor.pulses:,} beams in a turn or frame; a LiDAR has thousands"
 
 
-@lru_cache(maxsize=4)
-def _read_cached(path: Path, _content_hash: str) -> BeamTable:
-    angles: list[tuple[float, float]] = []
-    max_beams = limits.BEAMS.maximum
-    limits.checked_size(path, limits.FILE)
-    try:
-        with open_input(path) as content, io.TextIOWrapper(content, "utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file, skipinitialspace=True)
-            names = list(rows.fieldnames or ())
-            _check_beam_columns(path, names)
-            for number, row in enumerate(rows):
-                if None in row:  # e.g. a decimal comma, which shifts all following values by one column
-                    n_values = len(names) + len(row[None])
-                    problem = f"expected {len(names)} values, one per column, got {n_values}"
-                    raise InputError(f"{path}: beam {number}", problem, "Use decimal points, not decimal commas.")
-                elevation_deg = _parse_angle(path, number, "elevation_deg", row["elevation_deg"])
-                azimuth_deg = _parse_angle(path, number, "azimuth_deg", row["azimuth_deg"])
-                angles.append((elevation_deg, azimuth_deg))
-                if len(angles) > max_beams:
-                    raise InputError(path, f"the file has more than {max_beams:,} beams", limits.BEAMS.hint)
-    except (UnicodeDecodeError, csv.Error) as error:
-        hint = "Save it as UTF-8 text with a header row."
-        raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None
-    if not angles:
-        raise InputError(path, "expected at least one beam, got none", "Write one row per beam.")
-    table = np.array(angles)
-    return BeamTable(table[:, 0], table[:, 1])
+FEW_BEAMS_HINT = (
+    "If each row of its file is a ring, name the column azimuth_offset_deg instead of azimuth_deg and set"
+    " azimuth_step_deg; egvs sensors FILE prints what is read."
+)
 
 
-def _check_beam_columns(path: Path, names: list[str]) -> None:
-    hint = f"The header needs the columns {', '.join(BEAM_COLUMNS)}, separated by commas."
-    for column in BEAM_COLUMNS:
-        if column not in names:
-            raise InputError(path, f"the file has no column {column}", hint)
-        if names.count(column) > 1:
-            raise InputError(path, f"the file has {names.count(column)} columns {column}", hint)
-
-
-def _parse_angle(path: Path, number: int, column: str, text: str | None) -> float:
-    limit_deg = _MAX_ANGLE_DEG[column]
-    angle = number_or_nan(text or "", parse_decimal)
-    if not abs(angle) <= limit_deg:
-        problem = f"expected a number between {-limit_deg:g} and {limit_deg:g}, got {text!r}"
-        raise InputError(f"{path}: beam {number}: {column}", problem)
-    return angle
-
-
-def beams_from_pattern(pattern: BeamPatternConfig) -> BeamTable:
+def beams_from_pattern(pattern: BeamPatternConfig, find: Callable[[str], Path] = Path) -> BeamTable:
     r"""Return one frame of a sensor whose scan pattern does not repeat.
 
     With :math:`n` beams, and :math:`u, v` from 0 to 1 across the field of view in azimuth and elevation:
@@ -182,10 +84,17 @@ def beams_from_pattern(pattern: BeamPatternConfig) -> BeamTable:
       beam along :math:`2u - 1 = (\cos 2\pi p t + \cos 2\pi q t) / 2`,
       :math:`2v - 1 = (\sin 2\pi p t + \sin 2\pi q t) / 2`, with :math:`t = (k + 1/2) / n` (a Risley pair at small
       angles: Marshall 1999, Risley prism scan patterns, Proc. SPIE 3787);
-    - *even*: :math:`u = (k + 1/2) / n`, :math:`v = frac(1/2 + k (\sqrt 5 - 1) / 2)`, a Kronecker lattice.
+    - *even*: :math:`u = (k + 1/2) / n`, :math:`v = frac(1/2 + k (\sqrt 5 - 1) / 2)`, a Kronecker lattice;
+    - *file*: the directions of a CSV file, each with the probability that a frame has a pulse there: the number of
+      pulses times its share of the dwell time (:func:`egvs.sensors.beam_files.read_directions`). Scores count expected
+      hits; a simulated point cloud draws the pulses of its frame.
 
-    Angles are rounded to 1e-6 degree.
+    Angles of formulas are rounded to 1e-6 degree. ``find`` finds the file.
     """
+    if pattern.file is not None:
+        return read_directions(find(pattern.file), pattern.samples)
+    assert pattern.elevation_deg is not None
+    assert pattern.azimuth_deg is not None
     k = np.arange(pattern.samples)
     if pattern.turns is not None:
         first_prism, second_prism = (
@@ -273,6 +182,16 @@ class Sensor:
         if self.table is not None:
             return len(self.table)
         return self.channels * self.azimuths
+
+    @property
+    def beam_weight(self) -> FloatArray | None:
+        """Probability that a frame has each beam, (beams,) float64; None if each frame has all."""
+        return None if self.table is None else self.table.weight
+
+    @property
+    def pulses(self) -> int:
+        """Number of pulses of one turn or frame; of a sensor with dwell times fewer than its beams."""
+        return self.beams if self.beam_weight is None else round(float(self.beam_weight.sum()))
 
     @property
     def elevation_span_deg(self) -> tuple[float, float]:
@@ -416,7 +335,9 @@ def scenario_sensor(name: str, scenario: Scenario, where: str) -> Sensor:
     Messages name the key of ``[sites]`` that sets this sensor, if there is one, in place of ``where``.
     """
     where = _sites_key(name, scenario) or where
-    return resolve_sensor(name, scenario.sensors, where, lambda file: scenario.find(file, f"sensors.{name}.beams"))
+    config = scenario.sensors.get(name)
+    key = config.beam_file[0] if config is not None and config.beam_file is not None else "beams"
+    return resolve_sensor(name, scenario.sensors, where, lambda file: scenario.find(file, f"sensors.{name}.{key}"))
 
 
 def _sites_key(name: str, scenario: Scenario) -> str:
@@ -489,13 +410,49 @@ def _unknown_sensor(name: str, custom: Iterable[str], where: str) -> InputError:
     return InputError(where, f"unknown sensor {name!r}", hint)
 
 
+def _sensor_from_file(name: str, config: SensorConfig, source: str, path: Path) -> Sensor:
+    """Return a sensor whose beams a file states; its columns are those of the file or, if it has none, the user's."""
+    beams = read_beam_file(path).beams
+    where = f"sensors.{name}"
+    keys = [key for key in ("azimuth_step_deg", "azimuth_deg") if getattr(config, key) is not None]
+    if isinstance(beams, BeamTable):
+        if read_beam_file(path).dwell_s is not None:
+            problem = f"{path.name} has dwell times, which count only in a pattern"
+            hint = f'Use [sensors.{name}.pattern] with kind = "file", file = "{path.name}", samples = PULSES.'
+            raise InputError(f"{where}.beams", problem, hint)
+        if keys:
+            problem = f"no effect with {path.name}, which lists single beams"
+            raise InputError(f"{where}.{keys[0]}", problem, "Omit it, or give a file with a row per ring.")
+        return Sensor(name, (), (), 0, config.range_m, source, table=beams, **config.optics)
+    azimuths, azimuth_deg = beams.azimuths, beams.azimuth_deg
+    if azimuths is not None and keys:
+        problem = f"no effect with {path.name}, which states {azimuths:,} columns"
+        raise InputError(f"{where}.{keys[0]}", problem, "Omit it.")
+    if azimuths is None:
+        if config.azimuth_step_deg is None:
+            problem = f"expected azimuth_step_deg, since {path.name} lists {len(beams.elevations_deg)} rings, got none"
+            raise InputError(where, problem, "Give the angle between neighbouring beams of a ring.")
+        azimuths, azimuth_deg = config.azimuths, config.azimuth_deg
+        limits.BEAMS.check(where, azimuths * len(beams.elevations_deg))
+    return Sensor(
+        name,
+        beams.elevations_deg,
+        beams.azimuth_offsets_deg,
+        azimuths,
+        config.range_m,
+        source,
+        azimuth_deg=azimuth_deg,
+        **config.optics,
+    )
+
+
 def _sensor_from_config(name: str, config: SensorConfig, source: str, find: Callable[[str], Path]) -> Sensor:
     elevations = tuple(config.elevations_deg)
     table = None
     if config.beams is not None:
-        table = read_beam_table(find(config.beams))
-    elif config.pattern is not None:
-        table = beams_from_pattern(config.pattern)
+        return _sensor_from_file(name, config, source, find(config.beams))
+    if config.pattern is not None:
+        table = beams_from_pattern(config.pattern, find)
     elif config.channels not in (None, len(elevations)):
         first, last = elevations
         elevations = tuple(np.round(np.linspace(first, last, config.rings), 9).tolist())

@@ -40,6 +40,7 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     traffic_checks.check_observed,
     scene_checks.check_sensors_known,
     scene_checks.warn_repeated_beams,
+    scene_checks.warn_few_beams,
     scene_checks.check_effects,
     scene_checks.check_poses,
     scene_checks.warn_sites_on_lanes,

@@ -212,8 +212,9 @@ def named_files(scenario: Scenario) -> Iterator[tuple[str, str]]:
             yield f"{prefix}.fcd", period.fcd
         yield from ((f"{prefix}.tracks", name) for name in period.tracks or ())
     for sensor_name, model in scenario.sensors.items():
-        if model.beams is not None:
-            yield f"sensors.{sensor_name}.beams", model.beams
+        if model.beam_file is not None:
+            key, file = model.beam_file
+            yield f"sensors.{sensor_name}.{key}", file
 
 
 def measured_scan_files(candidates: Iterable[Site]) -> Iterator[tuple[str, str]]:

@@ -133,6 +133,21 @@ def warn_repeated_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
         yield Diagnostic("repeated beams", where, problem, hint)
 
 
+def warn_few_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about sensors with fewer beams than any LiDAR has."""
+    scenario = inputs.scenario
+    for name in dict.fromkeys(site.sensor for site in inputs.sites):
+        try:
+            problem = sensor.describe_few_beams(scenario_sensor(name, scenario, name))
+        except InputError:
+            continue  # check_sensors_known reports it
+        if problem is not None:
+            config = scenario.sensors.get(name)
+            file = None if config is None else config.beam_file
+            where = f"sensors.{name}" if file is None else file[1]
+            yield Diagnostic("few beams", where, problem, sensor.FEW_BEAMS_HINT)
+
+
 def check_effects(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report each effect that cannot act in this scenario, or lacks something that it needs."""
     if inputs.scene is None or any(check_sensors_known(inputs)):

@@ -68,12 +68,13 @@ def site_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:
 
 
 def sensor_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:
-    """Return the sha256 of the beam tables of the user's sensors, and of the catalogue entries of the others."""
+    """Return the sha256 of the beam files of the user's sensors, and of the catalogue entries of the others."""
     digests = {}
     for name in dict.fromkeys(site.sensor for site in sites):
         config = scenario.sensors.get(name)
-        if config is not None and config.beams is not None:
-            digests[config.beams] = hash_input(scenario.find(config.beams, f"sensors.{name}.beams"))
+        if config is not None and config.beam_file is not None:
+            key, file = config.beam_file
+            digests[file] = hash_input(scenario.find(file, f"sensors.{name}.{key}"))
         elif config is None and name in sensor.catalogue_entries():
             digests[f"catalogue: {name}"] = sensor.catalogue_digest(name)
     return digests

@@ -15,7 +15,7 @@ from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
 from egvs.extensions.validation.detector_runs import SiteDetectionTask
 from egvs.extensions.validation.detectors import base
 from egvs.extensions.validation.detectors.cluster import Cluster
-from egvs.extensions.validation.detectors.pointpillars import HeightOrigin, PillarPoints
+from egvs.extensions.validation.detectors.pointpillars import INTENSITY, HeightOrigin, PillarPoints
 from egvs.extensions.validation.plan_validation import FusedDetectionTask, SensorGroup
 from tests.extensions.validation.stub_detectors import MiddleDetector
 
@@ -90,7 +90,14 @@ def test_pillar_points_are_relative_to_their_own_sensor(mini):
     np.testing.assert_allclose(points.height_m, [0, 0, 1, 1])  # from the first one's sensor
     np.testing.assert_array_equal(points.is_foreground, [True, False, True, False])
     np.testing.assert_allclose(points.range_m, [5, 20, 5, 20])
-    np.testing.assert_allclose(points.intensity, [0.5, 0.25, 0.5, 0.25])
+    np.testing.assert_allclose(points.intensity, [INTENSITY] * 4)
+    own = PillarPoints.from_sweeps([sweep, sweep], views, zero, None)
+    np.testing.assert_allclose(own.intensity, [0.5, 0.25, 0.5, 0.25])
+    unknown = Sweep(sweep.points * np.array([1.0, 1.0, 1.0, np.nan], np.float32), sweep.beam)
+    same = PillarPoints.from_sweeps([unknown, sweep], views, zero)
+    np.testing.assert_array_equal(same.intensity, points.intensity)
+    with pytest.raises(ValueError, match="no intensity"):
+        PillarPoints.from_sweeps([unknown, sweep], views, zero, None)
 
 
 def _sensor(scenario):

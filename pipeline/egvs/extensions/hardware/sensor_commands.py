@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -83,6 +84,14 @@ def fit(
             metavar="X,Y[,Z]", help="With --scenario: where the sensor is in its world, to 2 m; Z if it has no ground."
         ),
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="State the pose by a calibration of this unit (JSON with a 4 x 4 matrix from its frame into a map),"
+            " and where the ground plane is in that map.",
+        ),
+    ] = None,
     without_empty_sector: Annotated[
         bool,
         typer.Option(
@@ -99,6 +108,7 @@ def fit(
     with ProgressDisplay("sensor fit") as screen:
         from egvs.extensions.hardware.fit import fit as fitting
         from egvs.extensions.hardware.fit import output, sweep_files
+        from egvs.extensions.hardware.fit.calibration import read_calibrated_pose
 
         if not name:
             raise InputError("--name", "no name is given", "Use --name north-mast.")
@@ -114,6 +124,8 @@ def fit(
         if map_options is not None:
             screen.progress("map", 6, 7)
             result = fitting.with_map_pose(result, *map_options)
+        if calibration is not None:
+            result = replace(result, calibrated_pose=read_calibrated_pose(calibration, result.plane))
         screen.progress("writing", 6, 7)
         written = output.write_fit(result, name, folder, without_empty_sector=without_empty_sector)
     print_fit(result, written)
@@ -154,6 +166,7 @@ def _sector(text: str) -> tuple[float, float]:
 def print_fit(result: SensorFit, written: FitFolder) -> None:
     """Print the fitted values, the ground planes, and the files."""
     from egvs.cli.console import WIDE, Column, console, make_table
+    from egvs.extensions.hardware.fit.output import calibration_lines
 
     out = console(WIDE)
     angles = result.angles
@@ -165,7 +178,7 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
     lines = [
         f"sweeps: {len(result.sweeps)}; {returns:,} returns, {missing:,} missing returns; not used: {stray:,} on no "
         f"ring, {repeated:,} further returns of a pulse",
-        f"order of points in the first sweep: {result.layout}",
+        f"order of points in the first sweep: {result.layout}; rings from the {_ring_source(result)}",
         f"elevations: {angles.channels} channels from {angles.elevation_deg.min():.3f} to "
         f"{angles.elevation_deg.max():.3f} degrees, largest standard error {angles.elevation_se_deg.max():.0e}",
         f"vertical offsets: {1000 * angles.offset_m.min():.1f} to {1000 * angles.offset_m.max():.1f} mm, as of optics "
@@ -210,12 +223,21 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
     ]
     out.print(make_table(columns, range(len(planes))))
     out.print(f"Check in {written.folder / 'ground.png'} that the chosen plane is the road; if not, use --ground N.")
+    if result.calibrated_pose is not None:
+        for line in calibration_lines(result.calibrated_pose):
+            out.print(line)
     if result.map_pose is not None:
         for line in _map_lines(result.map_pose):
             out.print(line)
         out.print(f"Check in {written.folder / 'map.png'} that the returns lie on the walls.")
     for file in written.names:
         print(written.folder / file)
+
+
+def _ring_source(result: SensorFit) -> str:
+    if result.has_file_rings:
+        return "file"
+    return f"points. {result.ring_note}" if result.ring_note else "points"
 
 
 def _direction(result: SensorFit) -> str:

@@ -6,20 +6,31 @@ found in it (elevations by ALICE-LRI, second differences and return shares by a 
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from benchmarks.sensor_fit import SENSORS, angle_errors, fit_list, hard_truth, interval_hits
-from benchmarks.simulated_sweeps import simulate_sweep
+from benchmarks.simulated_sweeps import Truth, simulate_sweep
 
+from egvs.extensions.hardware.fit.beam_angles import fit_beam_angles
+from egvs.extensions.hardware.fit.calibration import read_calibrated_pose
 from egvs.extensions.hardware.fit.empty_scan import TRAFFIC
 from egvs.extensions.hardware.fit.fit import SensorFit, fit_sensor
-from egvs.extensions.hardware.fit.sweep_files import read_sweeps
+from egvs.extensions.hardware.fit.sweep_files import Sweep, read_sweeps
 from egvs.sensors.sensor import CATALOGUE
 from egvs.statistics.intervals import Estimate
+from tests.extensions.hardware.fit.small_sensor import (
+    OUSTER_AXIS_M,
+    OUSTER_ELEVATIONS_DEG,
+    OUSTER_FRAME_M,
+    ouster_sweep,
+)
 
-CHENGDU = Path(__file__).parents[5] / "shared" / "real" / "chengdu"
+REAL = Path(__file__).parents[5] / "shared" / "real"
+CHENGDU, TUMTRAF = REAL / "chengdu", REAL / "tumtraf"
 
 
 @pytest.mark.slow
@@ -47,6 +58,65 @@ def test_intervals_contain_the_true_values() -> None:
     assert np.mean(hits["return rate, smooth surfaces"]) >= 0.85
     for what in ("range noise, by range", "range noise, by channel", "return rate, by range and incidence"):
         assert np.mean(hits[what]) >= 0.91
+
+
+def test_beams_off_the_axis() -> None:
+    """A twin of an Ouster on a gantry: all beams, both offsets, and the height over the ground."""
+    points, channel = ouster_sweep()
+    returned = np.isfinite(points[:, 0])
+    fit = fit_sensor([Sweep("twin", points[returned], ring=channel[returned])])
+    angles = fit.angles
+    assert angles.channels == 40
+    assert np.abs(angles.elevation_deg - OUSTER_ELEVATIONS_DEG).max() < 0.002
+    assert angles.axis_distance_m == pytest.approx(OUSTER_AXIS_M, abs=2e-4)
+    assert np.abs(angles.origins_m()[..., 2] - OUSTER_FRAME_M).max() < 5e-4
+    assert (angles.azimuths, angles.direction) == (512, 1)
+    assert (fit.grids[0].off_grid, fit.grids[0].repeated) == (0, 0)
+    truth = Truth()
+    # The plane is below the origin of the frame, 36 mm below the optics.
+    assert fit.plane.height_m == pytest.approx(truth.height_m - OUSTER_FRAME_M, abs=0.02)
+    assert fit.plane.roll_deg == pytest.approx(truth.roll_deg, abs=0.1)
+    assert fit.plane.pitch_deg == pytest.approx(truth.pitch_deg, abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("instant", ["1646667310_053239541", "1646667315_454719936"])
+def test_tumtraf_sweeps(instant: str) -> None:
+    """An installed OS1-64, below horizon: its beams, the road under labelled cars, and its calibrated pose.
+
+    People put the boxes of cars onto the road, so their bottoms say where the road is: 8.2 m below the sensor. The
+    calibration puts the sensor 7.48 m above the origin of a map, which is 0.7 m above the road.
+    """
+    if not TUMTRAF.is_dir():
+        pytest.skip("shared/real/tumtraf is not beside the checkout")
+    name = f"{instant}_s110_lidar_ouster_south"
+    (sweep,) = read_sweeps([TUMTRAF / f"{name}.pcd.gz"])
+    fit = fit_sensor([sweep])
+    angles = fit.angles
+    assert (angles.channels, angles.azimuths, angles.direction, fit.has_file_rings) == (64, 2048, -1, True)
+    # The maker states angles to 0.01 degrees, and 15.806 mm and 36.18 mm for this model.
+    assert np.abs(angles.elevation_deg - np.round(angles.elevation_deg, 2)).max() < 1e-3
+    assert angles.axis_distance_m == pytest.approx(0.015806, abs=5e-5)
+    assert angles.origins_m()[..., 2].mean() == pytest.approx(0.03618, abs=5e-5)
+    assert fit.grids[0].off_grid == 0
+    # Without the field, the same rings are found from the points.
+    found, layout = fit_beam_angles([replace(sweep, ring=None)])
+    assert (layout.has_file_rings, found.channels) == (False, 64)
+    assert np.abs(np.sort(found.elevation_deg) - np.sort(angles.elevation_deg)).max() < 1e-3
+
+    document = json.loads((TUMTRAF / f"{name}.json").read_text(encoding="utf-8"))
+    (frame,) = document["openlabel"]["frames"].values()
+    boxes = [item["object_data"] for item in frame["objects"].values() if item["object_data"]["type"] == "CAR"]
+    centres = np.array([box["cuboid"]["val"] for box in boxes])
+    bottoms = centres[:, :3] - centres[:, 9:] * (0.0, 0.0, 0.5)
+    near = np.hypot(bottoms[:, 0], bottoms[:, 1]) < 40.0
+    assert np.count_nonzero(near) >= 5
+    assert np.abs(np.median(fit.plane.distance_m(bottoms[near]))) < 0.15
+
+    calibrated = read_calibrated_pose(TUMTRAF / "calib_s110_lidar_ouster_south.json", fit.plane)
+    assert (calibrated.frame, calibrated.pose.z_m) == ("s110_base", 7.48077521)
+    assert calibrated.ground_z_m == pytest.approx(-0.77, abs=0.05)
+    assert calibrated.ground_tilt_deg < 1.0
 
 
 @pytest.fixture(scope="module")

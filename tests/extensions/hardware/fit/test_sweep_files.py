@@ -138,3 +138,38 @@ def test_rejects_bad_file(tmp_path: Path, make, message: str) -> None:
         read_sweeps([path])
     assert message in str(caught.value)
     assert path.name in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["ring", "channel"])
+@pytest.mark.parametrize("suffix", [".pcd", ".ply", ".csv", ".pcd.gz"])
+def test_rings_of_the_file(tmp_path: Path, suffix: str, name: str) -> None:
+    ring = np.arange(3000, dtype=np.uint16) % 40
+    made = points()
+    path = tmp_path / f"sweep{suffix.removesuffix('.gz')}"
+    if suffix == ".csv":
+        rows = "\n".join(f"{x!r},{y!r},{c},{z!r}" for (x, y, z), c in zip(made.tolist(), ring, strict=True))
+        path.write_text(f"x_m,y_m,{name},z_m\n{rows}\n", encoding="utf-8")
+    else:
+        columns = {axis: made[:, number] for number, axis in enumerate("xyz")} | {name: ring}
+        (ply if suffix == ".ply" else pcd).write_columns(path, columns)
+    if suffix.endswith(".gz"):
+        path.with_name("sweep.pcd.gz").write_bytes(gzip.compress(path.read_bytes()))
+        path = path.with_name("sweep.pcd.gz")
+    sweep = read_sweeps([path])[0]
+    assert sweep.ring is not None
+    np.testing.assert_array_equal(sweep.ring, ring)
+    assert sweep.returns == 2997
+
+
+def test_field_that_is_no_ring_number_is_ignored(tmp_path: Path) -> None:
+    columns = {axis: points()[:, number] for number, axis in enumerate("xyz")}
+    for value in (0.5, -1.0, np.nan, 70_000.0):
+        pcd.write_columns(tmp_path / "sweep.pcd", columns | {"ring": np.full(3000, value)})
+        assert read_sweeps([tmp_path / "sweep.pcd"])[0].ring is None
+
+
+def test_damaged_ring_column_is_refused(tmp_path: Path) -> None:
+    rows = "".join(f"1,2,3,{number if number != 7 else 'seven'}\n" for number in range(2500))
+    (tmp_path / "sweep.csv").write_text(f"x_m,y_m,z_m,ring\n{rows}", encoding="utf-8")
+    with pytest.raises(InputError, match=r"sweep.csv: line 9: ring: expected a number, got 'seven'"):
+        read_sweeps([tmp_path / "sweep.csv"])

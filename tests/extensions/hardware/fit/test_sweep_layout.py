@@ -13,7 +13,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.fit.sweep_layout import find_layout, find_rings, fit_cone, nearest_ring
 from egvs.sensors.sensor import CATALOGUE
-from tests.extensions.hardware.fit.small_sensor import ELEVATIONS_DEG, TRUTH, sweep_of
+from tests.extensions.hardware.fit.small_sensor import ELEVATIONS_DEG, TRUTH, ouster_sweep, sweep_of
 
 AZIMUTHS, CHANNELS = 900, len(ELEVATIONS_DEG)
 RANK = np.argsort(np.argsort(ELEVATIONS_DEG))
@@ -64,6 +64,61 @@ def test_offset_of_optics_does_not_merge_dense_rings() -> None:
     layout = find_rings(points[np.isfinite(points[:, 0])], "sweep")
     assert layout.channels == sensor.channels
     assert not (layout.channel < 0).any()
+
+
+def test_rings_of_beams_off_the_axis() -> None:
+    """A list of returns near a sensor whose frame begins 36 mm below its optics, without and with the rings."""
+    points, channel = ouster_sweep()
+    returned = np.isfinite(points[:, 0])
+    points, channel = points[returned], channel[returned]
+    for ring in (None, channel):
+        layout = find_layout(points, "sweep", ring)
+        assert (layout.order, layout.channels, layout.has_file_rings) == ("list of returns", 40, ring is not None)
+        expected = 39 - channel if ring is None else channel  # found rings ascend
+        np.testing.assert_array_equal(layout.channel, expected)
+
+
+def test_list_sorted_by_ring_is_not_organised() -> None:
+    """Its rows of equal length are of one elevation each, as in an organised sweep with more channels."""
+    points, channel = ouster_sweep()
+    order = np.argsort(channel, kind="stable")
+    points = points[order][np.isfinite(points[order, 0])][:19_000]
+    layout = find_layout(points, "sweep")
+    assert (layout.order, layout.column) == ("list of returns", None)
+
+
+@pytest.mark.parametrize("order", ["channel fastest", "column fastest"])
+def test_rings_of_the_file_keep_columns(organised: FloatArray, order: str) -> None:
+    ring, points = np.tile(np.arange(CHANNELS), AZIMUTHS) + 3, organised
+    if order == "column fastest":
+        ring = ring.reshape(AZIMUTHS, CHANNELS).T.ravel()
+        points = organised.reshape(AZIMUTHS, CHANNELS, 3).transpose(1, 0, 2).reshape(-1, 3)
+    layout = find_layout(points, "sweep", ring)
+    assert (layout.order, layout.channels, layout.note) == (order, CHANNELS, "")
+    np.testing.assert_array_equal(layout.channel, ring - 3)
+    assert layout.column is not None
+    assert int(layout.column.max()) == AZIMUTHS - 1
+
+
+def test_ring_field_without_rings_is_not_used(organised: FloatArray) -> None:
+    zeros = np.zeros(len(organised), dtype=np.int64)
+    layout = find_layout(organised, "sweep", zeros)
+    assert (layout.channels, layout.has_file_rings) == (CHANNELS, False)
+    assert layout.note == "The field ring has 1 values, so rings are found from the points."
+    mixed = np.random.default_rng(0).integers(0, CHANNELS, len(organised))
+    layout = find_layout(organised, "sweep", mixed)
+    assert (layout.channels, layout.has_file_rings) == (CHANNELS, False)
+    assert "of the returns are on no ring" in layout.note
+
+
+def test_ring_with_few_returns_is_counted() -> None:
+    points, channel = ouster_sweep()
+    few = np.flatnonzero(np.isfinite(points[:, 0]) & (channel == 7))[:5]
+    used = np.isfinite(points[:, 0]) & (channel != 7)
+    used[few] = True
+    layout = find_layout(points[used], "sweep", channel[used])
+    assert (layout.channels, layout.silent) == (39, 1)
+    assert set(layout.channel[channel[used] == 7]) == {-1}
 
 
 def test_rejects_cloud_without_rings() -> None:

@@ -23,7 +23,8 @@ from egvs.extensions.hardware.installation.acceptance_limits import Limits
 from egvs.extensions.hardware.installation.scan_comparison import ScanComparison, StaticWorld
 from egvs.extensions.hardware.registration import PARAMETERS, StaticSurfaces, register_scan
 from egvs.scoring.visibility import Beams
-from egvs.sensors.sensor import BeamTable, Sensor
+from egvs.sensors.beam_files import BeamTable
+from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Pose
 from egvs.world.ray_casting import Caster
 from tests.conftest import collection, feature

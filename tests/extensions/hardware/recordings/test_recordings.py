@@ -20,7 +20,7 @@ from egvs.extensions.hardware.fit.fit import fit_sensor
 from egvs.extensions.hardware.fit.sweep_files import read_sweeps
 from egvs.extensions.hardware.recordings import ros_bags, velodyne_pcap
 from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
-from egvs.extensions.hardware.recordings.recordings import chosen_sweeps
+from egvs.extensions.hardware.recordings.recordings import chosen_sweeps, ring_numbers, sweep_blocks
 from tests.extensions.hardware.fit.small_sensor import TRUTH, coarse_sensor, sweep_of
 from tests.extensions.hardware.recordings.ros_recordings import TOPIC, write_recording
 from tests.extensions.hardware.recordings.velodyne_packets import ELEVATIONS_DEG, packets, write_pcap
@@ -120,20 +120,39 @@ def message(dtype: np.dtype, rows: int, padding: int, **values: FloatArray) -> S
 def test_decodes_any_layout_of_points(order: str) -> None:
     """Fields out of order with gaps, padded rows, either byte order; integers of time are nanoseconds."""
     dtype = np.dtype(
-        {"names": ["z", "t", "x", "y"], "formats": [f"{order}f8", f"{order}u4", f"{order}f8", f"{order}f8"],
-         "offsets": [4, 12, 20, 28], "itemsize": 40}
+        {"names": ["z", "t", "x", "y", "ring"],
+         "formats": [f"{order}{kind}" for kind in ("f8", "u4", "f8", "f8", "u2")],
+         "offsets": [4, 12, 20, 28, 36], "itemsize": 40}
     )  # fmt: skip
     x, y = np.array([1.0, 2.0, np.nan, 4.0]), np.array([5.0, 6.0, np.nan, 8.0])
     t = np.array([4_000_000_000, 4_000_500_000, 4_001_000_000, 4_001_500_000])
-    points_m, time_s = ros_bags.decode_points(message(dtype, 2, 7, x=x, y=y, z=-x, t=t))
+    values = {"x": x, "y": y, "z": -x, "t": t, "ring": np.array([0, 63, 1, 2])}
+    points_m, time_s, ring = ros_bags.decode_points(message(dtype, 2, 7, **values))
     np.testing.assert_array_equal(points_m, np.column_stack([x, y, -x]))
     np.testing.assert_allclose(time_s, [0.0, 0.0005, 0.001, 0.0015], atol=1e-12)
+    np.testing.assert_array_equal(ring, [0, 63, 1, 2])
+
+
+def test_blocks_carry_times_and_rings() -> None:
+    """Either without the other; times that are none are not taken for some."""
+    points, values = np.ones((4, 3)), np.array([0.0, 0.02, 0.05, 0.1])
+    for time_s, ring in ((values, values * 10), (values, None), (None, np.arange(4.0)), (None, None)):
+        blocks = list(sweep_blocks("one", points, time_s, ring))
+        assert len(blocks) == (1 if time_s is None and ring is None else 2)
+        if len(blocks) == 2:
+            columns = blocks[1].points_m
+            expected = np.full(4, np.nan) if time_s is None else time_s
+            np.testing.assert_array_equal(columns[:, 0], expected)
+            np.testing.assert_array_equal(columns[:, 1], np.full(4, np.nan) if ring is None else ring)
+    assert ring_numbers(values * 10) is None
+    assert ring_numbers(np.full(4, np.nan)) is None
+    np.testing.assert_array_equal(ring_numbers(np.arange(4.0)), np.arange(4))
 
 
 def test_rejects_contradictory_message() -> None:
     dtype = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     sound = message(dtype, 2, 0, x=np.ones(4), y=np.ones(4), z=np.ones(4))
-    assert ros_bags.decode_points(sound)[1] is None
+    assert ros_bags.decode_points(sound)[1:] == (None, None)
     for key, value, problem in (
         ("width", 3, "has 48"),
         ("point_step", 0, "points of 0 bytes"),

@@ -2,11 +2,14 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import egvs
 from egvs import load
+from egvs.clouds.simulation import CloudSimulator, sweep_rng
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME as POINTS_ON
@@ -15,6 +18,8 @@ from egvs.extensions.validation.detector_runs import SiteDetectionTask
 from egvs.extensions.validation.detectors import pointpillars
 from egvs.extensions.validation.detectors.pointpillars import POINTS_PER_PILLAR, PillarPoints, PillarWindow
 from egvs.extensions.validation.held_out_traffic import prepare_held_out_traffic
+from egvs.sensors.sites import Pose
+from tests.clouds.cloud_scenes import random_frame
 
 
 def _pillar_points(rows):
@@ -118,6 +123,30 @@ def test_shipped_model_has_metadata():
     assert "nishishinjuku" not in metadata["junctions"] and len(metadata["junctions"]) >= 4
     assert metadata["curve"][-1]["step"] == metadata["recipe"]["steps"]
     assert metadata["curve"][-1]["ap_bev_r40_iou50"] > 0.5  # of held-out frames and poses
+
+
+def test_detections_do_not_depend_on_intensity(mini):
+    """Geometry alone decides; with each point's own intensity, the same network depends on it."""
+    scene = egvs.build_scene(load(mini, ["sites.sensor=VLP-32C"]))
+    simulator = CloudSimulator(scene, Pose(10.0, 12.0, 5.0), scene.sensor("VLP-32C"), "here")
+    frame = random_frame(np.random.default_rng(2), (20.0, 5.0, 0.0))
+    sweep = simulator.sweep(frame, sweep_rng(1, "here", 0)).sweep
+
+    def detect(detector, intensity):
+        points = sweep.points.copy()
+        points[:, 3] = intensity
+        return detector.at_site(simulator.view, scene.roi).detect(replace(sweep, points=points))
+
+    shipped, fed = pointpillars.PointPillars(), pointpillars.PointPillars(intensity=None)
+    expected = detect(shipped, sweep.points[:, 3])
+    assert len(expected.boxes)
+    for intensity in (0.0, 0.5, 1.0, np.nan, sweep.points[::-1, 3]):
+        found = detect(shipped, intensity)
+        np.testing.assert_array_equal(found.boxes, expected.boxes)
+        np.testing.assert_array_equal(found.scores, expected.scores)
+    assert not np.array_equal(detect(fed, 0.0).scores, detect(fed, 1.0).scores)
+    np.testing.assert_array_equal(detect(fed, pointpillars.INTENSITY).scores, expected.scores)
+    assert shipped.settings != fed.settings
 
 
 @pytest.mark.slow

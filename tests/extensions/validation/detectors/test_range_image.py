@@ -16,7 +16,8 @@ from egvs.extensions.validation.detection_metrics import paired_overlap
 from egvs.extensions.validation.detectors import base, range_image, segment_model
 from egvs.extensions.validation.detectors.range_image import FEATURES, RangeImage, RangeImageAtSite
 from egvs.extensions.validation.detectors.segment_model import MARGINS, SEGMENT_KINDS, BoostedTrees
-from egvs.sensors.sensor import CATALOGUE, BeamTable
+from egvs.sensors.beam_files import BeamTable
+from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose
 
 ROI = Roi((0.0, -20.0, 0.0), (40.0, 40.0, 5.0))
@@ -232,7 +233,8 @@ def test_shipped_model_says_how_it_was_made():
     about = content["about"]
     assert about["made_by"] == "python -m benchmarks.range_image_model"
     assert about["junctions"] == ["ingolstadt", "hill", "roundabout"]  # training junctions only
-    assert about["sensors"] == list(CATALOGUE)
+    assert len(about["sensors"]) == 12
+    assert set(about["sensors"]) <= set(CATALOGUE)
     assert about["features"] == list(FEATURES)
 
 

@@ -153,7 +153,7 @@ def fit_beam_angles(sweeps: Sequence[Sweep]) -> tuple[BeamAngles, Layout]:
     if not fine:
         hint = "Give a sweep with float32 coordinates, or text."
         raise InputError(sweeps[0].name, "expected a sweep that is finer than float16, got none", hint)
-    layout = find_layout(fine[0].points_m, fine[0].name)
+    layout = find_layout(fine[0].points_m, fine[0].name, fine[0].ring)
     radius_m, height_m, channel = _pool(fine, layout)
 
     fits = [fit_cone(radius_m[channel == c], height_m[channel == c]) for c in range(layout.channels)]

@@ -11,6 +11,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.fit import empty_scan, ground_plane, range_noise, return_rates
 from egvs.extensions.hardware.fit.beam_angles import BeamAngles, PulseGrid, fit_beam_angles, pulse_grid, range_step
+from egvs.extensions.hardware.fit.calibration import CalibratedPose
 from egvs.extensions.hardware.fit.empty_scan import EmptyScanFit
 from egvs.extensions.hardware.fit.ground_plane import GroundPlane
 from egvs.extensions.hardware.fit.map_pose import MapPose, fit_map_pose
@@ -54,8 +55,10 @@ class SensorFit:
         The sweeps.
     layout
         Order of the first sweep's points, see :class:`egvs.extensions.hardware.fit.sweep_layout.Layout`.
+    has_file_rings, ring_note
+        Whether the rings are those that the file states; if not although it states some, why, as a sentence.
     silent_channels
-        Channels of an organised sweep with too few returns to be fitted.
+        Channels of an organised sweep, or rings of the file, with too few returns to be fitted.
     angles
         Directions of all pulses.
     grids
@@ -86,10 +89,14 @@ class SensorFit:
         How fast the sensor turns; None if the sweeps have no times.
     map_pose
         The pose in the world of a scenario; None unless :func:`with_map_pose` adds it.
+    calibrated_pose
+        The pose by a calibration file; None unless one is given.
     """
 
     sweeps: Sequence[Sweep]
     layout: str
+    has_file_rings: bool
+    ring_note: str
     silent_channels: int
     angles: BeamAngles
     grids: list[PulseGrid]
@@ -111,6 +118,7 @@ class SensorFit:
     residuals: RangeResiduals
     rotation: Rotation | None = None
     map_pose: MapPose | None = None
+    calibrated_pose: CalibratedPose | None = None
 
 
 def fit_sensor(
@@ -161,6 +169,8 @@ def fit_sensor(
     return SensorFit(
         sweeps=sweeps,
         layout=layout.order,
+        has_file_rings=layout.has_file_rings,
+        ring_note=layout.note,
         silent_channels=layout.silent,
         angles=angles,
         grids=grids,

@@ -18,6 +18,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
 from egvs.extensions.hardware.fit import empty_scan, figures
+from egvs.extensions.hardware.fit.calibration import CalibratedPose
 from egvs.extensions.hardware.fit.fit import SensorFit
 from egvs.extensions.hardware.fit.ground_plane import GroundPlane
 from egvs.extensions.hardware.fit.map_pose import MapPose
@@ -172,12 +173,25 @@ def _comments(fit: SensorFit, name: str) -> str:
             f"yaw {pose.yaw_deg:.3f}, pitch {pose.pitch_deg:.3f}, roll {pose.roll_deg:.3f} degrees."
         )
         lines += fit.map_pose.warnings
+    if fit.calibrated_pose is not None:
+        lines += calibration_lines(fit.calibrated_pose)
     if fit.return_rate is not None:
         lines.append(
             f"Lost returns on smooth surfaces: {format_percent(1 - fit.return_rate.value, 2)}. To model them: "
             f"[effects.dropout] share = {1 - fit.return_rate.value:.4f}"
         )
     return "".join(f"# {line}\n" for line in lines) + "\n"
+
+
+def calibration_lines(calibrated: CalibratedPose) -> list[str]:
+    """Return sentences about the pose by a calibration file."""
+    pose = calibrated.pose
+    return [
+        f"pose in {calibrated.frame} by {calibrated.file}: x {pose.x_m:.3f}, y {pose.y_m:.3f}, z {pose.z_m:.3f} m, "
+        f"yaw {pose.yaw_deg:.3f}, pitch {pose.pitch_deg:.3f}, roll {pose.roll_deg:.3f} degrees",
+        f"the chosen ground plane in {calibrated.frame}: z = {calibrated.ground_z_m:.2f} m below the sensor, tilted by "
+        f"{calibrated.ground_tilt_deg:.2f} degrees",
+    ]
 
 
 def format_sensor_table(name: str, table: dict[str, Any]) -> str:
@@ -220,6 +234,7 @@ def report(fit: SensorFit, name: str) -> dict[str, Any]:
             for sweep, grid in zip(fit.sweeps, fit.grids, strict=True)
         ],
         "order_of_points": fit.layout,
+        "rings_from": "the file" if fit.has_file_rings else "the points",
         "channels_with_too_few_returns": fit.silent_channels,
         "azimuth_step_deg": _value(angles.azimuth_step_deg, angles.azimuth_step_se_deg),
         "azimuths": angles.azimuths,
@@ -243,6 +258,8 @@ def report(fit: SensorFit, name: str) -> dict[str, Any]:
     }
     if fit.map_pose is not None:
         result["map_pose"] = _map_pose(fit.map_pose)
+    if fit.calibrated_pose is not None:
+        result["calibrated_pose"] = asdict(fit.calibrated_pose)
     if fit.empty_scan is not None:
         background, traffic, unknown = fit.empty_scan.counts
         result["empty_scan"] = {

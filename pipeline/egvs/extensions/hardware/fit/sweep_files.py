@@ -9,6 +9,8 @@ Recordings of ROS (:mod:`egvs.extensions.hardware.recordings.ros_bags`) and netw
 (:mod:`egvs.extensions.hardware.recordings.velodyne_pcap`) hold many sweeps, of which some are read, spread evenly.
 
 Nothing in a file's header says how its points are ordered; :mod:`egvs.extensions.hardware.fit.sweep_layout` finds out.
+Many files say of each point which ring it is from
+(:data:`egvs.extensions.hardware.recordings.recordings.RING_FIELDS`).
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from __future__ import annotations
 import gzip
 import zipfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +26,10 @@ import numpy as np
 
 from egvs.core import files, limits, readers
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import FloatArray, IntArray
 from egvs.core.reading import COMPLETE_FILE
 from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
-from egvs.extensions.hardware.recordings.recordings import RecordedSweep, Recording
+from egvs.extensions.hardware.recordings.recordings import RING_FIELDS, RecordedSweep, Recording, ring_numbers
 from egvs.formats import point_clouds
 
 MIN_RETURNS = 2000
@@ -58,6 +60,8 @@ class Sweep:
         Time of each point, seconds, from the first, (n,); None if the file does not say.
     recording
         The recording that the sweep is of; None for a file of one sweep.
+    ring
+        Which ring each point is from, (n,) int64; None if the file does not say.
     """
 
     name: str
@@ -65,6 +69,7 @@ class Sweep:
     is_coarse: bool = False
     time_s: FloatArray | None = None
     recording: Recording | None = None
+    ring: IntArray | None = None
 
     @property
     def returns(self) -> int:
@@ -124,7 +129,8 @@ def _recording_reader(path: Path) -> Any:
 def _recorded(recording: Recording, recorded: list[RecordedSweep]) -> Iterator[Sweep]:
     for sweep in recorded:
         points_m = _clean_sweep(sweep.label, sweep.points_m).points_m
-        yield Sweep(f"{recording.name}: {sweep.label}", points_m, time_s=sweep.time_s, recording=recording)
+        name = f"{recording.name}: {sweep.label}"
+        yield Sweep(name, points_m, time_s=sweep.time_s, recording=recording, ring=sweep.ring)
 
 
 def _read_gzip(path: Path) -> list[Sweep]:
@@ -153,7 +159,9 @@ def _read_file(path: Path, name: str) -> list[Sweep]:
         chunks.append(chunk.points_m - origin_m)
     if not chunks:
         raise InputError(name, "expected a sweep, got no points", COMPLETE_FILE)
-    return [_clean_sweep(name, np.concatenate(chunks))]
+    sweep = _clean_sweep(name, np.concatenate(chunks))
+    field = point_clouds.read_field(path, name, RING_FIELDS)
+    return [sweep if field is None else replace(sweep, ring=ring_numbers(field))]
 
 
 def _read_npz(path: Path, name: str) -> Iterator[Sweep]:

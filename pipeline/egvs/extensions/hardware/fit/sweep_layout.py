@@ -4,21 +4,25 @@ Two kinds of files exist. An *organised* sweep has a slot for each pulse, with a
 channel by channel within a column (a column is one azimuth step), or column by column within a channel. Headers often
 claim the wrong one of the two, so both are tested for every number of channels that divides the number of slots: the
 right one is the smallest number for which each channel keeps to one elevation. A *list of returns* has no slots; its
-points lie on as many cones as the sensor has channels, and :func:`find_rings` separates them by elevation.
+points lie on as many cones as the sensor has channels, and :func:`find_rings` separates them by elevation. Where the
+file says of each point which ring it is from (field ``ring``), the rings are those, provided that the points of each
+lie on one cone: many drivers fill the field with zeros, or with something else.
 
 A return's optical path need not start at the origin of the frame. A channel at elevation e whose rays start at a height
 z0 on the axis gives points on the cone
 
 .. math:: z = \rho \tan e + z_0, \qquad \rho = \sqrt{x^2 + y^2},
 
-so a few centimetres of offset smear the elevation of near points by more than the spacing of dense rings. Before
-either, one offset in radius and one in height for all channels are therefore chosen such that the elevations cluster
-best, as in the Hough transform of ALICE-LRI (Soutullo et al. 2025, arXiv 2510.20708).
+so a few centimetres of offset smear the elevation of near points by more than the spacing of dense rings. Rays of an
+Ouster start 12 to 28 mm beside the axis (``lidar_origin_to_beam_origin_mm``), and the frame of its driver begins 36 mm
+below: a point at 1 m is 2 degrees above the elevation of its beam. Before either, one offset in radius and one in
+height for all channels are therefore chosen such that the elevations cluster best, as in the Hough transform of
+ALICE-LRI (Soutullo et al. 2025, arXiv 2510.20708).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -33,6 +37,8 @@ MIN_COLUMNS = 100
 
 _ORGANISED_SPREAD_DEG = 0.2
 """Median spread of elevations within a channel, above which the slots are not in the tested order."""
+_COLUMN_SPREAD_DEG = 1.0
+"""Azimuths of neighbouring channels may differ by this much more or less in a column than on average."""
 _SPREAD_RATIO = 1.5
 """A number of channels fits as well as the best one if its spread is at most this multiple of the least spread."""
 _ROUNDING_DEG = 0.02
@@ -40,6 +46,9 @@ _MIN_RETURNS_PER_CHANNEL = 20
 
 _OFFSETS_M = np.arange(-0.10, 0.1001, 0.004)
 _SHARPNESS_BIN_DEG = 0.02
+_SHARPNESS_SAMPLE = 10_000
+_SHARPER = 1.02
+"""Shifts count only if they make elevations cluster by this factor better."""
 _BIN_DEG = 0.005
 _MIN_SPACING_DEG = 0.04
 _MIN_RING_SHARE = 0.02
@@ -49,7 +58,10 @@ _FINEST_M = 1e-6
 _MAX_RESIDUAL_DEG = 0.05
 _MAX_STRAY_SHARE = 0.2
 
-_HINT = "Give complete sweeps of a sensor with rings, in the sensor's frame (z along the axis of rotation)."
+_HINT = (
+    "Give complete sweeps of a sensor with rings, in the sensor's frame (z along the axis of rotation). Patterns that"
+    " do not repeat (Livox) cannot be fitted; use pattern.file with directions and dwell times."
+)
 
 
 @dataclass(frozen=True)
@@ -68,6 +80,10 @@ class Layout:
         (n,) int64; None for a list of returns.
     silent
         Number of further channels with fewer than 20 returns, which cannot be fitted.
+    has_file_rings
+        Whether the rings are those of the file.
+    note
+        Why the rings of the file are not used, as a sentence; empty if they are, or if the file has none.
     """
 
     order: str
@@ -75,9 +91,11 @@ class Layout:
     channel: IntArray
     column: IntArray | None
     silent: int = 0
+    has_file_rings: bool = False
+    note: str = ""
 
 
-def find_layout(points_m: FloatArray, where: str) -> Layout:
+def find_layout(points_m: FloatArray, where: str, ring: IntArray | None = None) -> Layout:
     """Return the layout of a sweep.
 
     Parameters
@@ -86,13 +104,56 @@ def find_layout(points_m: FloatArray, where: str) -> Layout:
         (n, 3), NaN for missing returns.
     where
         The sweep, for messages.
+    ring
+        The ring of each point by the file, (n,); None if it does not say.
 
     Raises
     ------
     InputError
         If the points do not lie on rings.
     """
-    return _organised_layout(points_m) or find_rings(points_m, where)
+    note = ""
+    if ring is not None:
+        layout, note = _layout_of_rings(points_m, ring)
+        if layout is not None:
+            return layout
+    return replace(_organised_layout(points_m) or find_rings(points_m, where), note=note)
+
+
+def _layout_of_rings(points_m: FloatArray, ring: IntArray) -> tuple[Layout | None, str]:
+    """Return the layout by the rings of the file; or None, and a sentence that says why they cannot be used."""
+    returned = np.isfinite(points_m[:, 0])
+    numbers, counts = np.unique(ring[returned], return_counts=True)
+    if not MIN_CHANNELS <= len(numbers) <= MAX_CHANNELS:
+        return None, f"The field ring has {len(numbers)} values, so rings are found from the points."
+    used = numbers[counts >= _MIN_RETURNS_PER_CHANNEL]
+    channel = np.where(np.isin(ring, used), np.searchsorted(used, ring), -1)
+    radius_m = axis_distances_m(points_m)
+    missed, members = 0, 0
+    for number in range(len(used)):
+        part = returned & (channel == number)
+        tangent, offset_m, _ = fit_cone(radius_m[part], points_m[part, 2])
+        miss_m = np.abs(points_m[part, 2] - radius_m[part] * tangent - offset_m) / (1.0 + tangent**2)
+        missed += int(np.count_nonzero(np.degrees(miss_m / radius_m[part]) > _MAX_RESIDUAL_DEG))
+        members += int(np.count_nonzero(part))
+    if missed > _MAX_STRAY_SHARE * max(members, 1):
+        share = format_percent(missed / max(members, 1), 0)
+        return None, f"By the field ring, {share} of the returns are on no ring, so rings are found from the points."
+    silent = len(numbers) - len(used)
+    order, column = _order_of_rings(ring)
+    return Layout(order, len(used), channel, column, silent, has_file_rings=True), ""
+
+
+def _order_of_rings(ring: IntArray) -> tuple[str, IntArray | None]:
+    """Return the order and the column of each slot; a list of returns unless the rings repeat from slot to slot."""
+    n, channels = len(ring), len(np.unique(ring))
+    if n % channels == 0 and n // channels >= MIN_COLUMNS:
+        slots = np.arange(n)
+        if (ring.reshape(-1, channels) == ring[:channels]).all():
+            return "channel fastest", slots // channels
+        if (ring.reshape(channels, -1) == ring[:: n // channels, None]).all():
+            return "column fastest", slots % (n // channels)
+    return "list of returns", None
 
 
 def _organised_layout(points_m: FloatArray) -> Layout | None:
@@ -122,6 +183,9 @@ def _organised_layout(points_m: FloatArray) -> Layout | None:
         column, channel = np.divmod(slots, channels)
     else:
         channel, column = np.divmod(slots, n // channels)
+    azimuth_deg = np.degrees(np.arctan2(points_m[:, 1], points_m[:, 0]))
+    if not _columns_agree(_by_channel(azimuth_deg, channels, order)):
+        return None
     used = np.bincount(channel[returned], minlength=channels) >= _MIN_RETURNS_PER_CHANNEL
     fitted = np.where(used[channel], (np.cumsum(used) - 1)[channel], -1)
     return Layout(order, int(np.count_nonzero(used)), fitted, column, channels - int(np.count_nonzero(used)))
@@ -132,6 +196,21 @@ def _by_channel(values: FloatArray, channels: int, order: str) -> FloatArray:
     if order == "channel fastest":
         return values.reshape(-1, channels).T
     return values.reshape(channels, -1)
+
+
+def _columns_agree(azimuth_deg: FloatArray) -> bool:
+    """Whether azimuths (channels, columns) of neighbouring channels differ by the same in most columns.
+
+    In a list of returns that is sorted by ring, neighbours in a row are of one ring as well, but rows have no common
+    columns.
+    """
+    phase = np.exp(1j * np.radians(np.diff(azimuth_deg, axis=0)))
+    filled = phase[np.isfinite(phase).sum(axis=1) >= _MIN_RETURNS_PER_CHANNEL]
+    if not len(filled):
+        return False
+    with np.errstate(invalid="ignore"):
+        deviation_deg = np.abs(np.degrees(np.angle(filled / np.nanmean(filled, axis=1)[:, None])))
+    return float(np.median(np.nanpercentile(deviation_deg, 80, axis=1))) < _COLUMN_SPREAD_DEG
 
 
 def _elevation_spread(elevation_deg: FloatArray) -> float:
@@ -204,12 +283,15 @@ def _check_ring_count(rings: int, where: str) -> None:
 def nearest_ring(
     radius_m: FloatArray, height_m: FloatArray, tangent: FloatArray, offset_m: FloatArray
 ) -> tuple[IntArray, FloatArray]:
-    """Return the ring whose cone is nearest to each point, and the angle between the two, degrees.
+    r"""Return the ring whose cone is nearest to each point, and the angle between the two, degrees.
 
     ``tangent`` is ascending. The cones of neighbouring rings do not cross within the range of returns, so the ring is
-    one of the two between whose heights at this radius the point lies.
+    one of the two between whose heights at this radius the point lies. The search starts where it would be if all
+    offsets followed :math:`z_c = z_0 - \rho_0 \tan e_c`: near an Ouster, whose rays start 36 mm above the origin of its
+    frame, the elevation from the origin is five rings off.
     """
-    ring = np.searchsorted(tangent, height_m / radius_m)
+    slope_m, common_m = np.polyfit(tangent, offset_m, 1) if len(tangent) > 1 else (0.0, float(offset_m[0]))
+    ring = np.searchsorted(tangent, (height_m - common_m) / np.maximum(radius_m + slope_m, 0.001))
     best = np.zeros(len(radius_m), dtype=np.int64)
     least = np.full(len(radius_m), np.inf)
     for shift in (-2, -1, 0, 1):
@@ -223,25 +305,25 @@ def nearest_ring(
 
 
 def _sharpest_elevations(radius_m: FloatArray, height_m: FloatArray) -> FloatArray:
-    """Return elevations (degrees) from the origin, shifted in radius and height, at which they cluster best."""
-    sample = slice(None, None, max(1, len(radius_m) // 40_000))
-    shift = {"radius": 0.0, "height": 0.0}
+    """Return elevations (degrees) from the origin, shifted in radius and height, at which they cluster best.
 
-    def elevations(shifted: dict[str, float], part: slice) -> FloatArray:
-        return np.degrees(np.arctan2(height_m[part] - shifted["height"], radius_m[part] - shifted["radius"]))
+    All pairs of shifts are tried: radius and height alone, one after the other, end in a lesser maximum where both are
+    far from 0.
+    """
+    sample = slice(None, None, max(1, len(radius_m) // _SHARPNESS_SAMPLE))
 
-    def sharpness(name: str, offset_m: float) -> float:
-        counts = np.bincount(
-            np.floor((elevations(shift | {name: offset_m}, sample) + 180) / _SHARPNESS_BIN_DEG).astype(int)
-        )
-        return float((counts.astype(np.float64) ** 2).sum())
+    def elevations(shift_m: tuple[float, float], part: slice) -> FloatArray:
+        return np.degrees(np.arctan2(height_m[part] - shift_m[1], radius_m[part] - shift_m[0]))
 
-    for name in ("radius", "height", "radius"):
-        scores = [sharpness(name, float(offset_m)) for offset_m in _OFFSETS_M]
-        best = int(np.argmax(scores))
-        if scores[best] > 1.02 * sharpness(name, 0.0):
-            shift[name] = float(_OFFSETS_M[best])
-    return elevations(shift, slice(None))
+    def sharpness(shift_m: tuple[float, float]) -> float:
+        bins = np.floor((elevations(shift_m, sample) + 180) / _SHARPNESS_BIN_DEG).astype(int)
+        return float((np.bincount(bins).astype(np.float64) ** 2).sum())
+
+    shifts_m = [(float(radius), float(height)) for radius in _OFFSETS_M for height in _OFFSETS_M]
+    best_m = max(shifts_m, key=sharpness)
+    if sharpness(best_m) <= _SHARPER * sharpness((0.0, 0.0)):
+        best_m = (0.0, 0.0)
+    return elevations(best_m, slice(None))
 
 
 def _histogram_peaks(elevation_deg: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """Files that hold several sweeps of a LiDAR: recordings of ROS, and network captures.
 
 A reader runs in a process of its own (:mod:`egvs.formats.reader_process`). It yields one block of values about the
-recording, then two for each sweep: the points, and their times.
+recording, then two for each sweep: the points, and their times and rings.
 """
 
 from __future__ import annotations
@@ -20,6 +20,10 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
 from egvs.formats.reader_process import Block, read_blocks
 
+RING_FIELDS = ("ring", "channel", "laser_id")
+"""Names of the field that says which ring a point is from; the first that a file has counts."""
+
+_MAX_RING = 1 << 16
 _SPANS_S = (0.002, 5.0)
 """The points of one sweep are recorded in between; times with another span are not in the expected unit."""
 
@@ -50,11 +54,12 @@ class Recording:
 
 
 class RecordedSweep(NamedTuple):
-    """Points of a sweep, (n, 3) float64, NaN for missing returns; their times, seconds, (n,), or None."""
+    """Points of a sweep, (n, 3) float64, NaN for missing returns; their times (seconds) and rings, (n,), or None."""
 
     label: str
     points_m: FloatArray
     time_s: FloatArray | None
+    ring: IntArray | None = None
 
 
 def chosen_sweeps(count: int, most: int) -> IntArray:
@@ -98,7 +103,8 @@ def read_recording(
                 limits.POINTS.check(where, count)
                 sweeps.append(RecordedSweep(values["label"], block.points_m, None))
             else:
-                sweeps[-1] = sweeps[-1]._replace(time_s=_plausible_times(block.points_m[:, 0]))
+                time_s, ring, _ = block.points_m.T
+                sweeps[-1] = sweeps[-1]._replace(time_s=_plausible_times(time_s), ring=ring_numbers(ring))
     finally:
         blocks.close()
     stamps_s = np.array(header["stamps_s"], dtype=np.float64)
@@ -111,6 +117,13 @@ def _plausible_times(time_s: FloatArray) -> FloatArray | None:
         return None
     relative = time_s - np.nanmin(time_s)
     return relative if _SPANS_S[0] <= np.nanmax(relative) <= _SPANS_S[1] else None
+
+
+def ring_numbers(field: FloatArray) -> IntArray | None:
+    """Return the values of a field as ring numbers, (n,) int64; None unless all are whole numbers below 65,536."""
+    with np.errstate(invalid="ignore"):
+        is_number = (field >= 0) & (field < _MAX_RING) & (field == np.floor(field))
+    return field.astype(np.int64) if is_number.all() else None
 
 
 # --- in the other process ---
@@ -127,10 +140,15 @@ def header_block(source: str, stamps_s: Sequence[float], notes: Sequence[str] = 
     return Block({"source": source, "stamps_s": list(stamps_s), "notes": list(notes)})
 
 
-def sweep_blocks(label: str, points_m: FloatArray, time_s: FloatArray | None) -> Iterator[Block]:
+def sweep_blocks(
+    label: str, points_m: FloatArray, time_s: FloatArray | None, ring: FloatArray | None = None
+) -> Iterator[Block]:
     """Yield the blocks of a sweep."""
     yield Block.of_points({"label": label}, points_m)
-    if time_s is not None:
-        columns = np.zeros((len(time_s), 3))
-        columns[:, 0] = time_s
+    if time_s is not None or ring is not None:
+        columns = np.full((len(points_m), 3), np.nan)
+        if time_s is not None:
+            columns[:, 0] = time_s
+        if ring is not None:
+            columns[:, 1] = ring
         yield Block.of_points({}, columns)

@@ -4,7 +4,8 @@ A recording is a ``.bag`` (ROS 1), an ``.mcap`` or ``.db3`` (ROS 2), or the fold
 ``metadata.yaml``. Each message ``sensor_msgs/PointCloud2`` is a sweep. Its fields ``x``, ``y``, ``z`` (float32 or
 float64, metres) may be anywhere in a point; missing returns are NaN. Times of points are read from the first of these
 fields that exists: ``time``, ``timestamp``, ``t``, ``offset_time``, ``time_stamp``; floating point numbers are seconds,
-integers nanoseconds. No ROS installation is needed.
+integers nanoseconds; rings from the first of
+:data:`egvs.extensions.hardware.recordings.recordings.RING_FIELDS`. No ROS installation is needed.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
 from egvs.extensions.hardware.recordings.recordings import (
+    RING_FIELDS,
     RecordedSweep,
     Recording,
     chosen_sweeps,
@@ -83,8 +85,7 @@ def _read_file(path: Path) -> Iterator[Block]:
             message: Any = reader.deserialize(data, connection.msgtype)
             frames.add(str(message.header.frame_id))
             label = f"{topic} at {stamps_s[number] - stamps_s[0]:.3f} s"
-            points_m, time_s = decode_points(message)
-            blocks += sweep_blocks(label, points_m, time_s)
+            blocks += sweep_blocks(label, *decode_points(message))
         yield header_block(f"topic {topic}, frame {', '.join(sorted(frames)) or 'not named'}", stamps_s)
         yield from blocks
 
@@ -109,8 +110,8 @@ def _stamp_s(message: Any) -> float:
     return float(stamp.sec) + _NANO * float(stamp.nanosec)
 
 
-def decode_points(message: Any) -> tuple[FloatArray, FloatArray | None]:
-    """Return the points (n, 3) of a ``PointCloud2``, row by row, and their times in seconds, (n,), if it has any.
+def decode_points(message: Any) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
+    """Return the points (n, 3) of a ``PointCloud2``, row by row, and times in seconds and rings, (n,), if it has them.
 
     Raises
     ------
@@ -147,13 +148,15 @@ def decode_points(message: Any) -> tuple[FloatArray, FloatArray | None]:
     if any(dtype.kind != "f" for dtype, _ in axes):
         raise ValueError("expected floating point numbers in the fields x, y, z")
     points_m = np.column_stack([values for _, values in axes])
+    rings = [column(name)[1] for name in RING_FIELDS if name in fields]
+    ring = rings[0] if rings else None
     name = next((name for name in _TIME_FIELDS if name in fields), None)
     if name is None:
-        return points_m, None
+        return points_m, None, ring
     dtype, time = column(name)
     if dtype.kind != "f":
         time = (time - time.min(initial=np.inf)) * _NANO if len(time) else time
-    return points_m, time
+    return points_m, time, ring
 
 
 if __name__ == "__main__":

@@ -10,8 +10,13 @@ so that the mounting height does not matter. The other convention, that of detec
 from 3 m below it to 1 m above), is for comparison. The points of several sensors are combined in the world frame;
 whether a point is foreground, and its range, are relative to its own sensor.
 
-Features of a point: x, y from the centre of its pillar, height, intensity, x, y, z from the mean of the pillar's
-points, whether it is foreground, and its range as a share of 50 m.
+Features of a point: x, y from the centre of its pillar, height, :data:`INTENSITY`, x, y, z from the mean of the
+pillar's points, whether it is foreground, and its range as a share of 50 m.
+
+**Intensity** is not used. Simulated intensities are those of ideal surfaces, which no real sensor reports, and a
+network that sees them depends on them: with 1 for all points, the shipped model loses 25 points of AP. Its channel is
+therefore fed one constant, at detection and at training. With the constant, the shipped model, which was trained with
+simulated intensities, has the AP that it had with them (docs/validation.md).
 
 **Maps.** For each cell, the network returns the log odds that the centre of a vehicle is there, and the values of a
 box: its centre relative to that of the cell, its height, its size, and twice its heading (a box looks the same from
@@ -57,6 +62,10 @@ POINTS_PER_PILLAR = 16
 """Largest number of points of a pillar; of more, some are selected at equal steps."""
 
 N_FEATURES = 9
+
+INTENSITY = 0.17
+"""Stands for the intensity of every point: that of asphalt. Of the constants that ``python -m benchmarks.intensity``
+tries at the training junctions, it has the highest AP."""
 
 STRIDE = 2
 """Pillars along each side of a cell of the network's maps."""
@@ -156,7 +165,7 @@ class PillarPoints:
     height_m
         By the height convention, (n,).
     intensity
-        0 to 1, (n,).
+        Fed to the network, (n,).
     is_foreground
         Whether each point is in front of the empty scan, (n,).
     range_m
@@ -170,15 +179,28 @@ class PillarPoints:
     range_m: FloatArray
 
     @classmethod
-    def from_sweeps(cls, sweeps: Sequence[Sweep], views: Sequence[SiteView], origin: HeightOrigin) -> PillarPoints:
-        """Combine the sweeps of one instant, in the order of the sites."""
+    def from_sweeps(
+        cls,
+        sweeps: Sequence[Sweep],
+        views: Sequence[SiteView],
+        origin: HeightOrigin,
+        intensity: float | None = INTENSITY,
+    ) -> PillarPoints:
+        """Combine the sweeps of one instant, in the order of the sites.
+
+        ``intensity`` stands for that of all points; with None, each has its own.
+        """
         points_m = [background.points_in_world(sweep, view) for sweep, view in zip(sweeps, views, strict=True)]
         foreground = [background.foreground_mask(sweep, view) for sweep, view in zip(sweeps, views, strict=True)]
         ranges_m = [np.sqrt((sweep.points[:, :3].astype(np.float64) ** 2).sum(axis=1)) for sweep in sweeps]
         xyz_m = np.concatenate(points_m)
-        intensity = np.concatenate([sweep.points[:, 3] for sweep in sweeps])
+        fed = np.concatenate([sweep.points[:, 3] for sweep in sweeps])
+        if intensity is not None:
+            fed = np.full_like(fed, intensity)
+        elif np.isnan(fed).any():
+            raise ValueError("the points have no intensity")
         heights_m = np.concatenate([points[:, 2] - origin.z_m(points[:, :2]) for points in points_m])
-        return cls(xyz_m[:, :2], heights_m, intensity, np.concatenate(foreground), np.concatenate(ranges_m))
+        return cls(xyz_m[:, :2], heights_m, fed, np.concatenate(foreground), np.concatenate(ranges_m))
 
 
 @dataclass(frozen=True)
@@ -336,16 +358,26 @@ def _start_session(path: Path) -> InferenceSession:
 
 @dataclass(frozen=True)
 class PointPillars:
-    """The detector with one model; can be sent to another process."""
+    """The detector with one model; can be sent to another process.
+
+    Attributes
+    ----------
+    model
+        The network.
+    intensity
+        Fed in place of the intensity of all points; None feeds that of each point, for comparison only.
+    """
 
     model: Path = SHIPPED_MODEL
+    intensity: float | None = INTENSITY
     NAME: ClassVar[str] = "pointpillars"
     SOURCE: ClassVar[str] = "Lang et al. 2019 (pillars, backbone), Yin et al. 2021 (head); trained on simulated sweeps"
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The sha256 of the model."""
-        return {"model": files.hash_file(self.model)}
+        """The sha256 of the model, and the intensity that it is fed if it is not that of each point."""
+        fed = {} if self.intensity is None else {"intensity": self.intensity}
+        return {"model": files.hash_file(self.model), **fed}
 
     def at_site(self, view: SiteView, roi: Roi) -> AtOneSite[_AtSites]:
         """Prepare the detector for one site."""
@@ -353,7 +385,7 @@ class PointPillars:
 
     def at_sites(self, views: Sequence[SiteView], roi: Roi) -> _AtSites:
         """Prepare the detector for several sites."""
-        return _AtSites(OnnxModel.load(self.model), tuple(views), roi)
+        return _AtSites(OnnxModel.load(self.model), self.intensity, tuple(views), roi)
 
 
 @dataclass(frozen=True)
@@ -361,6 +393,7 @@ class _AtSites:
     """The detector at several sites, whose points are combined."""
 
     model: OnnxModel
+    intensity: float | None
     views: tuple[SiteView, ...]
     roi: Roi
 
@@ -374,7 +407,7 @@ class _AtSites:
 
     def detect(self, sweeps: Sequence[Sweep]) -> Detections:
         """Return the vehicles of one instant."""
-        points = PillarPoints.from_sweeps(sweeps, self.views, self._origin)
+        points = PillarPoints.from_sweeps(sweeps, self.views, self._origin, self.intensity)
         by_window = [self._detect_in(window, points) for window in self._windows]
         boxes = np.concatenate([detections.boxes for detections in by_window])
         scores = np.concatenate([detections.scores for detections in by_window])
