@@ -22,7 +22,6 @@ from egvs.artefacts.run_record import RunRecord
 from egvs.cli import console as cli_console
 from egvs.cli import study_tables
 from egvs.core.errors import InputError
-from egvs.core.files import add_checksum
 from egvs.report.sensor_text import SENSOR_EVIDENCE, describe_losses
 from egvs.results.ranking import RankedSite, Ranking, ScoreValue, share_of_limit
 from egvs.scenario.score_config import CostsConfig
