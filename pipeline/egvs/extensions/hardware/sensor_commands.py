@@ -12,7 +12,7 @@ from egvs.cli.options import Detector, Jobs, Set, SettingsPath
 from egvs.core.errors import InputError
 from egvs.core.wording import format_percent
 from egvs.extensions.hardware.design_request import ALL_SENSORS, ELEVATION_BOUNDS_DEG, DesignRequest
-from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
+from egvs.formats.recording_options import RecordingOptions
 
 if TYPE_CHECKING:
     from egvs.extensions.hardware.design import Design, DesignResult
@@ -107,8 +107,9 @@ def fit(
     plugins.require_libraries("egvs sensor fit", "figure", "matplotlib")
     with ProgressDisplay("sensor fit") as screen:
         from egvs.extensions.hardware.fit import fit as fitting
-        from egvs.extensions.hardware.fit import output, sweep_files
+        from egvs.extensions.hardware.fit import output
         from egvs.extensions.hardware.fit.calibration import read_calibrated_pose
+        from egvs.formats import sweep_files
 
         if not name:
             raise InputError("--name", "no name is given", "Use --name north-mast.")

@@ -20,12 +20,12 @@ from egvs.core.wording import format_percent
 from egvs.extensions.hardware.fit import empty_scan, figures
 from egvs.extensions.hardware.fit.calibration import CalibratedPose
 from egvs.extensions.hardware.fit.fit import SensorFit
-from egvs.extensions.hardware.fit.ground_plane import GroundPlane
 from egvs.extensions.hardware.fit.map_pose import MapPose
 from egvs.extensions.hardware.fit.range_noise import NoiseBin
 from egvs.extensions.hardware.registration import PARAMETERS
 from egvs.formats import pcd, ply
 from egvs.scenario.sensor_config import SensorConfig
+from egvs.sensors.ground_plane import GroundPlane
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.statistics.intervals import Estimate
 
