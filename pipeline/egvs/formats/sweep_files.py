@@ -86,8 +86,8 @@ def read_sweeps(paths: Sequence[str | Path], options: RecordingOptions | None = 
     Parameters
     ----------
     paths
-        Files with the suffix .pcd, .ply, .las, .laz, .csv, .e57, .bin or .npz, or of a format that an installed package adds;
-        also with .gz after it. Or recordings: .bag, .mcap, .db3, the folder of a ROS 2 recording, or .pcap.
+        Files with the suffix .pcd, .ply, .las, .laz, .csv, .e57, .bin or .npz, or of a format that an installed package
+        adds; also with .gz after it. Or recordings: .bag, .mcap, .db3, the folder of a ROS 2 recording, or .pcap.
     options
         What is read of recordings.
 

@@ -6,6 +6,9 @@ import numpy as np
 
 from egvs.core.grid import FloatArray, IntArray
 
+MARGIN_M = 0.1
+"""Points up to this far beyond the sides and the roof of a box are on it: three standard deviations of a range."""
+
 BOTTOM_M = 0.15
 """The lowest part of a box, which may hold returns from the road, is left out."""
 
@@ -35,10 +38,11 @@ def points_in_boxes(points_m: FloatArray, boxes: FloatArray) -> IntArray:
 def are_inside(points_m: FloatArray, box: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Return which points are in a box (7,), above its lowest part, (n,) bool."""
     length, width, height, yaw = box[3:].tolist()
+    half_length, half_width, half_height = 0.5 * length + MARGIN_M, 0.5 * width + MARGIN_M, 0.5 * height + MARGIN_M
     cos, sin = np.cos(yaw), np.sin(yaw)
     x, y, z = (points_m - box[:3]).T
     inside: np.ndarray[tuple[int], np.dtype[np.bool_]]
     with np.errstate(invalid="ignore"):
-        inside = (np.abs(cos * x + sin * y) <= length / 2) & (np.abs(cos * y - sin * x) <= width / 2)
-        inside &= (z <= height / 2) & (z >= BOTTOM_M - height / 2)
+        inside = (np.abs(cos * x + sin * y) <= half_length) & (np.abs(cos * y - sin * x) <= half_width)
+        inside &= (z <= half_height) & (z >= BOTTOM_M - 0.5 * height)
     return inside

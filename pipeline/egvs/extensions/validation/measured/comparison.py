@@ -404,9 +404,7 @@ def point_rows(points: BoxPoints) -> list[PointsRow]:
     return rows
 
 
-def _points_row(
-    points: BoxPoints, boxes: NDArray[np.bool_], name: str, ranges: tuple[int, int] | None
-) -> PointsRow:
+def _points_row(points: BoxPoints, boxes: NDArray[np.bool_], name: str, ranges: tuple[int, int] | None) -> PointsRow:
     measured, simulated, expected = points.measured[boxes], points.simulated[boxes], points.expected[boxes]
     objects = points.object[boxes]
     return PointsRow(
@@ -484,9 +482,7 @@ def _levels(
             return {key: ratio_of_sums(chances(view)[members], ones, objects) for key, view in views.items()}
 
         detectors = {} if name == "people" else means(detection_chances)
-        rows.append(
-            LevelRow(name, int(members.sum()), len(np.unique(objects)), detectors, means(noticed_chances))
-        )
+        rows.append(LevelRow(name, int(members.sum()), len(np.unique(objects)), detectors, means(noticed_chances)))
     return rows
 
 
@@ -504,13 +500,11 @@ def _few_objects(
     objects = len(np.unique(points.object[cars]))
     if objects < ENOUGH_OBJECTS:
         notes.append(
-            f"{objects} different cars in {len(pairs)} sweeps are an anchor, not a validation: the errors do not contain "
-            "how far another place or unit differs."
+            f"{objects} different cars in {len(pairs)} sweeps are an anchor, not a validation: the errors do not "
+            "contain how far another place or unit differs."
         )
     if model is None:
         notes.append("The sensor has no rated range, so no losses are simulated or fitted: add rated_range_m.")
     elif fit is None:
         notes.append(f"Losses are not fitted: expected at least {return_fit.MIN_OBJECTS} different cars with points.")
     return notes
-
-

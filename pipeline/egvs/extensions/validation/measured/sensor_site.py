@@ -1,8 +1,8 @@
 """Where the sensor of measured sweeps stands, and what its beams meet without road users.
 
-Without a scenario the world is the ground plane below the sensor, fitted to all sweeps together: what stands on it hides
-nothing. The sensor is above the origin, its x axis along the world's, so that boxes keep their headings up to the tilt.
-With a scenario, the pose is that of a site, and the world is that of the scenario.
+Without a scenario the world is the ground plane below the sensor, fitted to all sweeps together: what stands on it
+hides nothing. The sensor is above the origin, its x axis along the world's, so that boxes keep their headings up to the
+tilt. With a scenario, the pose is that of a site, and the world is that of the scenario.
 """
 
 from __future__ import annotations

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from egvs.cli.console import Column, print_sentences, print_table
 from egvs.core import files
-from egvs.core.wording import format_percent, number_of
+from egvs.core.wording import number_of
 from egvs.drawing import pages
 from egvs.extensions.validation.measured.comparison import Comparison, LevelRow, PointsRow, Ratio
-from egvs.sensors.return_model import ReturnModel
+from egvs.sensors.sensor_table import format_sensor_table, sensor_keys
 
 JSON_FILE, PAGE_FILE, SENSOR_FILE = "against.json", "against.html", "sensor.toml"
 TEMPLATES = Path(__file__).parent.parent / "templates"
@@ -26,6 +26,8 @@ LOSSES = {
 }
 
 _FILE_WIDTH = 150
+
+Row = TypeVar("Row")
 
 
 def ratio_text(ratio: Ratio) -> str:
@@ -94,7 +96,7 @@ def sentences(comparison: Comparison) -> Iterator[str]:
     """Yield what the tables mean, and what was assumed."""
     points, site = comparison.points, comparison.site
     sweeps = number_of(len(comparison.sweeps), "sweep")
-    yield f"{site.sensor.name}: {len(points):,} labelled boxes in {sweeps}, held against the simulation of the same boxes."
+    yield f"{site.sensor.name}: {len(points):,} labelled boxes in {sweeps}, beside the simulation of the same boxes."
     cars = points.of_class("car")
     on_box, measured = points.on_box[cars].sum(), int(points.measured[cars].sum())
     if measured:
@@ -121,20 +123,100 @@ def sentences(comparison: Comparison) -> Iterator[str]:
             yield f"{text}, with a softness of {fit.softness:.1f}, which these cars do not show."
 
 
-def sensor_table(comparison: Comparison) -> str:
+def fitted_table(comparison: Comparison) -> str:
     """Return the lines of ``[sensors.NAME]`` with the fitted losses; empty without a fit."""
     fit, sensor, model = comparison.fit, comparison.site.sensor, comparison.model
     if fit is None or model is None:
         return ""
+    keys = sensor_keys(sensor) | {
+        "rated_range_m": round(fit.rated_range_m, 1),
+        "rated_reflectivity": model.rated_reflectivity,
+        "softness": fit.softness,
+        "dropout": fit.dropout,
+    }
     lines = [
-        f"# Losses fitted to {fit.vehicles} labelled boxes of {fit.objects} cars; rated range at a reflectivity of cars",
-        f"# of {model.target_reflectivity():g}. Beams and optics are those of {sensor.name}: copy its other keys from",
-        f'# [sensors."{sensor.name}"] of the scenario, or of egvs sensors "{sensor.name}".',
-        f'[sensors."{sensor.name} fitted"]',
-        *_beam_lines(comparison),
-        f"rated_range_m = {fit.rated_range_m:.1f}",
-        f"rated_reflectivity = {model.rated_reflectivity:g}",
-        f"softness = {fit.softness:g}",
-        f"dropout = {fit.dropout:g}",
+        f"# Losses fitted to {number_of(fit.vehicles, 'labelled box', 'labelled boxes')} of "
+        f"{number_of(fit.objects, 'car')}, at a reflectivity of cars of {model.target_reflectivity():g}."
     ]
-    return "\n".join(lines) + "\n"
+    if sensor.table is not None:
+        lines.append(f"# Add the key beams or pattern of {sensor.name}.")
+    return "\n".join(lines) + "\n" + format_sensor_table(f"{sensor.name} fitted", keys)
+
+
+def print_comparison(comparison: Comparison) -> None:
+    """Print both tables, the fitted sensor, and sentences."""
+    print_sentences(["Points on vehicles (± 2 se)"])
+    print_table(POINT_COLUMNS, comparison.rows, file_width=_FILE_WIDTH)
+    print_sentences(["", "Level: what should be found of them (± 2 se)"])
+    print_table(level_columns(comparison), level_rows(comparison), file_width=_FILE_WIDTH)
+    print_sentences(["", *sentences(comparison)])
+    if table := fitted_table(comparison):
+        print_sentences(["", table.rstrip()])
+
+
+def write_comparison(comparison: Comparison, folder: Path) -> list[Path]:
+    """Write the results as JSON, the page, and the fitted sensor if there is one; return the files.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written.
+    """
+    files.ensure_writable_folder(folder / JSON_FILE)
+    written = [folder / JSON_FILE, folder / PAGE_FILE]
+    files.write_text(written[0], files.to_json_text(to_json(comparison), indent=1) + "\n")
+    files.write_text(written[1], render_page(comparison))
+    if table := fitted_table(comparison):
+        written.append(folder / SENSOR_FILE)
+        files.write_text(written[-1], table)
+    return written
+
+
+def to_json(comparison: Comparison) -> dict[str, Any]:
+    """Return the results as JSON values; unknown numbers are null."""
+    points, fit = comparison.points, comparison.fit
+    boxes = zip(
+        points.sweep.tolist(), points.names, points.classes, points.range_m.tolist(), points.measured.tolist(),
+        points.simulated.tolist(), points.expected.tolist(), points.on_box.tolist(), strict=True,
+    )  # fmt: skip
+    keys = ("sweep", "object", "class", "range_m", "measured", "simulated", "with_losses", "on_box")
+    values: dict[str, Any] = {
+        "sensor": comparison.site.sensor.name,
+        "pose": asdict(comparison.site.pose),
+        "sweeps": list(comparison.sweeps),
+        "points": [asdict(row) for row in comparison.rows],
+        "levels": [asdict(row) for row in comparison.levels],
+        "losses": None if comparison.model is None else asdict(comparison.model),
+        "fitted_losses": None if fit is None else asdict(fit) | {"limit_interval_m": list(fit.limit_interval_m)},
+        "headings": None if comparison.convention is None else comparison.convention[0],
+        "notes": list(sentences(comparison)),
+        "boxes": [dict(zip(keys, box, strict=True)) for box in boxes],
+    }
+    return _without_nan(values)
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def render_page(comparison: Comparison) -> str:
+    """Return the page, HTML text."""
+    levels = level_columns(comparison)
+    tables = [
+        ("Points on vehicles (± 2 se)", _cells(POINT_COLUMNS, comparison.rows)),
+        ("What should be found of them (± 2 se)", _cells(levels, level_rows(comparison))),
+    ]
+    return pages.render(
+        pages.page_environment(TEMPLATES), "against.html.j2",
+        sensor=comparison.site.sensor.name, boxes=len(comparison.points), sweeps=comparison.sweeps, tables=tables,
+        sentences=list(sentences(comparison)), table=fitted_table(comparison),
+    )  # fmt: skip
+
+
+def _cells(columns: Sequence[Column[Row]], rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+    """Return the heads and the cells of a table."""
+    return [column.title for column in columns], [[column.text(row) for column in columns] for row in rows]

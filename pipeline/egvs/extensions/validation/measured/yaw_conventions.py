@@ -67,7 +67,7 @@ def find_convention(pairs: Pairs) -> tuple[str, dict[str, int]]:
         )
     ranked = sorted(held, key=lambda name: -held[name])
     best = ranked[0]
-    if len(ranked) > 1 and held[best] < MIN_RATIO * held[ranked[1]] or not held[best]:
+    if (len(ranked) > 1 and held[best] < MIN_RATIO * held[ranked[1]]) or not held[best]:
         counts = ", ".join(f"{name} {count:,}" for name, count in held.items())
         problem = f"the convention of headings is not clear: points in boxes by convention: {counts}"
         hint = f"State it: --yaw {best}. If boxes hold few points in all of them, labels are in another frame."
