@@ -85,7 +85,8 @@ def validate(
 
     of_sweeps = {"--labels": labels, "--sensor": sensor, "--site": site, "--yaw": yaw, "--columns": columns}
     if against:
-        _validate_against(scenario, set_, out, tuple(against), tuple(labels or ()), sensor, site, yaw, columns)
+        files = tuple(against), tuple(labels or ())
+        _validate_against(scenario, set_, out, files, sensor, site, yaw, columns, detector)
         return
     for option, value in of_sweeps.items():
         if value is not None:
@@ -125,31 +126,38 @@ def _validate_against(
     scenario: Path | None,
     set_: list[str] | None,
     out: Path | None,
-    sweeps: tuple[Path, ...],
-    labels: tuple[Path, ...],
+    sweeps_and_labels: tuple[tuple[Path, ...], tuple[Path, ...]],
     sensor: str | None,
     site: str | None,
     yaw: str | None,
     columns: str | None,
+    detector: str,
 ) -> None:
-    """Hold measured sweeps against the simulation."""
+    """Hold measured sweeps against the simulation, or without labels, against one another."""
     from egvs.cli.console import ProgressDisplay
     from egvs.core import files
+    from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
     from egvs.extensions.validation.measured import tables
-    from egvs.extensions.validation.measured.comparison import ComparisonRequest, compare_labelled
+    from egvs.extensions.validation.measured.comparison import ComparisonRequest, compare_labelled, compare_unlabelled
     from egvs.extensions.validation.measured.yaw_conventions import CONVENTIONS
     from egvs.scenario.loading import load
 
+    sweeps, labels = sweeps_and_labels
     if scenario is None and set_:
         raise InputError("--set", "expected a scenario, got none", "Name the scenario.")
     if yaw is not None and yaw not in CONVENTIONS:
         raise InputError("--yaw", f"expected {', '.join(CONVENTIONS)}, got {yaw!r}", "Omit it to find it.")
-    if not labels:
-        raise InputError("--labels", "expected labels of the sweeps, got none", "Add --labels FILE or a folder.")
-    request = ComparisonRequest(sweeps, labels, sensor, site, yaw, _column_names(columns))
+    named = [name.strip() for name in detector.split(",") if name.strip()]
+    detectors = tuple(name for name in dict.fromkeys(named) if name != POINT_COUNTS_NAME)
+    request = ComparisonRequest(sweeps, labels, sensor, site, yaw, columns=_column_names(columns), detectors=detectors)
     loaded = None if scenario is None else load(scenario, set_ or ())
     if out is not None:
         files.ensure_writable_folder(out / tables.JSON_FILE)
+    if not labels:
+        with ProgressDisplay("validate"):
+            repetition = compare_unlabelled(request, loaded)
+        tables.print_repetition(repetition)
+        return
     with ProgressDisplay("validate"):
         comparison = compare_labelled(request, loaded)
     tables.print_comparison(comparison)

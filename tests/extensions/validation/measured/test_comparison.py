@@ -18,8 +18,8 @@ from egvs.extensions.validation.measured.comparison import (
     Comparison,
     ComparisonRequest,
     compare_labelled,
-    ratio_of_sums,
 )
+from egvs.extensions.validation.measured.ratios import ratio_of_sums
 from egvs.extensions.validation.measured.tables import fitted_table, sentences
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.sensors.return_model import ReturnModel

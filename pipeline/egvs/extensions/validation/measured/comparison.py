@@ -17,8 +17,7 @@ unit or another person differs.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,8 +28,12 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.simulation import BodyCaster, VehicleMeshes, builtin_bodies
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.extensions.validation.detectors.base import make_detector
 from egvs.extensions.validation.measured import return_fit, sensor_site, yaw_conventions
 from egvs.extensions.validation.measured.box_points import BOTTOM_M, points_in_boxes
+from egvs.extensions.validation.measured.detection import DetectionRow, DetectorTask, detection_row
+from egvs.extensions.validation.measured.ratios import Ratio, ratio_of_sums
+from egvs.extensions.validation.measured.repetition import Repetition, measure_repetition
 from egvs.extensions.validation.measured.return_fit import ReturnFit
 from egvs.extensions.validation.measured.sensor_site import SensorSite
 from egvs.formats import sweep_labels
@@ -39,19 +42,15 @@ from egvs.formats.sweep_files import Sweep, read_sweeps
 from egvs.formats.sweep_labels import LabelOptions, SweepLabels, match_labels, read_labels
 from egvs.scenario.model import Scenario
 from egvs.scoring.noticed import noticed_chances
-from egvs.scoring.target_scores import detection_chances
+from egvs.scoring.target_scores import MODELLED, chances_by_detector, detection_chances
 from egvs.scoring.targets import TargetRecord, TargetVisibility, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.return_model import ReturnModel
-from egvs.statistics.blocks import jackknife_variance
 
 RANGES_M = ((0, 20), (20, 30), (30, 40), (40, 60), (60, 80), (80, 120))
 
 PEOPLE = ("pedestrian", "bicycle")
 """vClasses of labels that are no vehicles."""
-
-FEW_OBJECTS = 5
-"""Ratios of fewer objects have no error that means anything."""
 
 ENOUGH_OBJECTS = 30
 """With fewer, a sentence says that the comparison is an anchor, not a validation."""
@@ -99,14 +98,6 @@ class BoxPoints:
     def of_class(self, name: str) -> NDArray[np.bool_]:
         """Return which boxes are of a class, (n,)."""
         return np.array([other == name for other in self.classes], dtype=np.bool_)
-
-
-@dataclass(frozen=True)
-class Ratio:
-    """A ratio of sums over boxes, and its standard error; NaN without measured points, or with too few objects."""
-
-    value: float
-    se: float
 
 
 @dataclass(frozen=True)
@@ -181,6 +172,8 @@ class Comparison:
         Losses fitted to cars; None with too few of them, or without a rated range.
     levels
         By group of road users.
+    detections
+        What detectors find of vehicles, by detector and group.
     convention
         Convention of headings that was found, and the points that boxes hold in each; None where it is stated.
     notes
@@ -194,6 +187,7 @@ class Comparison:
     model: ReturnModel | None
     fit: ReturnFit | None
     levels: tuple[LevelRow, ...]
+    detections: tuple[DetectionRow, ...]
     convention: tuple[str, dict[str, int]] | None
     notes: tuple[str, ...]
 
@@ -214,6 +208,8 @@ class ComparisonRequest:
         Columns of a table of labels, see :class:`egvs.formats.sweep_labels.LabelOptions`.
     recording
         What is read of recordings.
+    detectors
+        Names of detectors that run on the sweeps.
     """
 
     sweeps: tuple[Path, ...]
@@ -223,6 +219,7 @@ class ComparisonRequest:
     yaw: str | None = None
     columns: dict[str, str] | None = None
     recording: RecordingOptions | None = None
+    detectors: tuple[str, ...] = ()
 
 
 def compare_labelled(request: ComparisonRequest, scenario: Scenario | None = None) -> Comparison:
@@ -269,9 +266,17 @@ def compare_labelled(request: ComparisonRequest, scenario: Scenario | None = Non
         model=model,
         fit=fit,
         levels=tuple(levels),
+        detections=tuple(_detections(request.detectors, site, pairs, frames, points, visible, model)),
         convention=convention,
         notes=(*site.assumptions, *notes, *_few_objects(points, pairs, fit, model)),
     )
+
+
+def compare_unlabelled(request: ComparisonRequest, scenario: Scenario | None = None) -> Repetition:
+    """Return which returns of several sweeps of one place repeat; parameters and errors as :func:`compare_labelled`."""
+    sweeps = read_sweeps(sweep_labels.list_files(request.sweeps, *_SWEEP_KINDS), request.recording)
+    sensor = sensor_site.find_sensor(request.sensor, scenario)
+    return measure_repetition(sensor_site.on_ground_plane(sensor, sweeps), sweeps)
 
 
 def _find_site(request: ComparisonRequest, scenario: Scenario | None, sweeps: Sequence[Sweep]) -> SensorSite:
@@ -421,27 +426,6 @@ def _points_row(points: BoxPoints, boxes: NDArray[np.bool_], name: str, ranges: 
     )
 
 
-def ratio_of_sums(above: FloatArray, below: FloatArray | IntArray, objects: IntArray) -> Ratio:
-    """Return the ratio of two sums over boxes, with its standard error from leaving out one object at a time.
-
-    Parameters
-    ----------
-    above, below
-        Of each box, (n,).
-    objects
-        Object that each box is of, (n,) int64.
-    """
-    numbers, group = np.unique(objects, return_inverse=True)
-    top, bottom = np.bincount(group, weights=above), np.bincount(group, weights=below)
-    if not bottom.sum():
-        return Ratio(math.nan, math.nan)
-    value = float(top.sum() / bottom.sum())
-    rest = bottom.sum() - bottom
-    if len(numbers) < FEW_OBJECTS or not rest.all():
-        return Ratio(value, math.nan)
-    return Ratio(value, math.sqrt(float(jackknife_variance((top.sum() - top) / rest))))
-
-
 GROUPS = {
     "cars": ("car",),
     "larger vehicles": ("van", "truck", "trailer", "bus", "tram"),
@@ -484,6 +468,31 @@ def _levels(
         detectors = {} if name == "people" else means(detection_chances)
         rows.append(LevelRow(name, int(members.sum()), len(np.unique(objects)), detectors, means(noticed_chances)))
     return rows
+
+
+def _detections(
+    names: Sequence[str],
+    site: SensorSite,
+    pairs: Sequence[tuple[Sweep, SweepLabels]],
+    frames: Sequence[TrafficFrame],
+    points: BoxPoints,
+    visible: TargetVisibility,
+    model: ReturnModel | None,
+) -> Iterator[DetectionRow]:
+    """Yield what detectors find of cars and of larger vehicles."""
+    chosen = [make_detector(name) for name in names]
+    if not chosen:
+        return
+    task = DetectorTask.of(site, [sweep.points_m for sweep, _ in pairs], frames, model)
+    for detector in chosen:
+        found, chances = task.run(detector), None
+        if detector.NAME in MODELLED:
+            chances = np.zeros(len(points))
+            chances[visible.record.row] = chances_by_detector(visible, [detector.NAME])[0]
+        for group in ("cars", "larger vehicles"):
+            members = np.isin(points.classes, GROUPS[group])
+            if members.any():
+                yield detection_row(detector.NAME, group, found, members, points.object, chances)
 
 
 def _few_objects(

@@ -8,11 +8,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-from egvs.cli.console import Column, print_sentences, print_table
+from egvs.cli.console import Column, format_or_dash, print_sentences, print_table
+from egvs.clouds.simulation import REFLECTIVITY
 from egvs.core import files
 from egvs.core.wording import number_of
 from egvs.drawing import pages
-from egvs.extensions.validation.measured.comparison import Comparison, LevelRow, PointsRow, Ratio
+from egvs.extensions.validation.measured.comparison import Comparison, LevelRow, PointsRow
+from egvs.extensions.validation.measured.detection import NEARBY_M, DetectionRow
+from egvs.extensions.validation.measured.ratios import Ratio
+from egvs.extensions.validation.measured.repetition import Repetition, RepetitionRow
 from egvs.sensors.sensor_table import format_sensor_table, sensor_keys
 
 JSON_FILE, PAGE_FILE, SENSOR_FILE = "against.json", "against.html", "sensor.toml"
@@ -92,6 +96,25 @@ def level_rows(comparison: Comparison) -> list[tuple[str, LevelRow]]:
     return rows
 
 
+DETECTION_COLUMNS: list[Column[DetectionRow]] = [
+    Column("detector", lambda row: row.detector, "left"),
+    Column("of", lambda row: row.group, "left"),
+    Column("boxes", lambda row: f"{row.boxes:,}"),
+    Column("expected", lambda row: share_text(row.expected)),
+    Column("simulated", lambda row: share_text(row.simulated)),
+    Column("measured", lambda row: share_text(row.measured)),
+    Column(f"simulated, {NEARBY_M:g} m", lambda row: share_text(row.simulated_nearby)),
+    Column(f"measured, {NEARBY_M:g} m", lambda row: share_text(row.measured_nearby)),
+    Column("AUC", lambda row: "-" if math.isnan(row.auc) else f"{row.auc:.2f}"),
+    Column("expected to found, in quarters", lambda row: bins_text(row), "left", min_width=170),
+]
+
+
+def bins_text(row: DetectionRow) -> str:
+    """Return expected and found shares in four bins: ".20 to .27, .74 to .55, ..."."""
+    return ", ".join(f"{expected:.2f} to {found:.2f}" for expected, found in row.bins) or "-"
+
+
 def sentences(comparison: Comparison) -> Iterator[str]:
     """Yield what the tables mean, and what was assumed."""
     points, site = comparison.points, comparison.site
@@ -143,12 +166,45 @@ def fitted_table(comparison: Comparison) -> str:
     return "\n".join(lines) + "\n" + format_sensor_table(f"{sensor.name} fitted", keys)
 
 
+def print_repetition(repetition: Repetition) -> None:
+    """Print which returns repeat, and the rated range that the ground shows."""
+    columns: list[Column[RepetitionRow]] = [
+        Column("range", lambda row: f"{row.from_m}-{row.to_m} m", "left"),
+        Column("static returns", lambda row: f"{row.returns:,}"),
+        Column("repeat", lambda row: f"{100 * row.share:.1f} %"),
+        Column("rated range by the ground, m", lambda row: format_or_dash(row.rated_range_m, ".0f")),
+    ]
+    print_sentences([f"Returns that come again in the next of {len(repetition.sweeps):,} sweeps"])
+    print_table(columns, repetition.rows, file_width=_FILE_WIDTH)
+    print_sentences(["", *repetition_sentences(repetition)])
+
+
+def repetition_sentences(repetition: Repetition) -> Iterator[str]:
+    """Yield what the repetition of returns says."""
+    yield from repetition.site.assumptions[:1]
+    sensor, fit = repetition.site.sensor, repetition.fit
+    if fit is None:
+        yield "Too few returns are from the ground to fit the rated range."
+    else:
+        low_m, high_m = fit.interval_m
+        yield (
+            f"By {fit.returns:,} returns from the ground, half of the returns from a target of "
+            f"{sensor.rated_reflectivity:g} are lost at {fit.rated_range_m:.0f} m ({low_m:.0f} to {high_m:.0f}, 2 se), "
+            f"if the ground reflects {REFLECTIVITY['ground']:g}; the data sheet: "
+            f"{format_or_dash(sensor.rated_range_m, '.0f')} m."
+        )
+    yield "This is the sensor's part. What vehicles reflect does not follow from it: that needs labels."
+
+
 def print_comparison(comparison: Comparison) -> None:
     """Print both tables, the fitted sensor, and sentences."""
     print_sentences(["Points on vehicles (± 2 se)"])
     print_table(POINT_COLUMNS, comparison.rows, file_width=_FILE_WIDTH)
     print_sentences(["", "Level: what should be found of them (± 2 se)"])
     print_table(level_columns(comparison), level_rows(comparison), file_width=_FILE_WIDTH)
+    if comparison.detections:
+        print_sentences(["", "Detectors, sweep by sweep (boxes that overlap by more than 0.7; ± 2 se)"])
+        print_table(DETECTION_COLUMNS, comparison.detections, file_width=_FILE_WIDTH)
     print_sentences(["", *sentences(comparison)])
     if table := fitted_table(comparison):
         print_sentences(["", table.rstrip()])
@@ -186,6 +242,7 @@ def to_json(comparison: Comparison) -> dict[str, Any]:
         "sweeps": list(comparison.sweeps),
         "points": [asdict(row) for row in comparison.rows],
         "levels": [asdict(row) for row in comparison.levels],
+        "detections": [asdict(row) for row in comparison.detections],
         "losses": None if comparison.model is None else asdict(comparison.model),
         "fitted_losses": None if fit is None else asdict(fit) | {"limit_interval_m": list(fit.limit_interval_m)},
         "headings": None if comparison.convention is None else comparison.convention[0],
@@ -210,6 +267,9 @@ def render_page(comparison: Comparison) -> str:
         ("Points on vehicles (± 2 se)", _cells(POINT_COLUMNS, comparison.rows)),
         ("What should be found of them (± 2 se)", _cells(levels, level_rows(comparison))),
     ]
+    if comparison.detections:
+        title = "What detectors find, sweep by sweep (boxes that overlap by more than 0.7; ± 2 se)"
+        tables.append((title, _cells(DETECTION_COLUMNS, comparison.detections)))
     return pages.render(
         pages.page_environment(TEMPLATES), "against.html.j2",
         sensor=comparison.site.sensor.name, boxes=len(comparison.points), sweeps=comparison.sweeps, tables=tables,
