@@ -135,7 +135,6 @@ def _validate_against(
 ) -> None:
     """Hold measured sweeps against the simulation, or without labels, against one another."""
     from egvs.cli.console import ProgressDisplay
-    from egvs.core import files
     from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
     from egvs.extensions.validation.measured import tables
     from egvs.extensions.validation.measured.comparison import ComparisonRequest, compare_labelled, compare_unlabelled
@@ -151,8 +150,6 @@ def _validate_against(
     detectors = tuple(name for name in dict.fromkeys(named) if name != POINT_COUNTS_NAME)
     request = ComparisonRequest(sweeps, labels, sensor, site, yaw, columns=_column_names(columns), detectors=detectors)
     loaded = None if scenario is None else load(scenario, set_ or ())
-    if out is not None:
-        files.ensure_writable_folder(out / tables.JSON_FILE)
     if not labels:
         with ProgressDisplay("validate"):
             repetition = compare_unlabelled(request, loaded)
