@@ -102,7 +102,8 @@ def read_sweeps(paths: Sequence[str | Path], options: RecordingOptions | None = 
     for path in map(Path, paths):
         reader = _recording_reader(path)
         if reader is not None:
-            sweeps += _recorded(*reader.read(path, path.name, options), options)
+            recording, recorded = reader.read(path, path.name, options)
+            sweeps += _recorded(recording, recorded, options)
             continue
         limits.checked_size(path, limits.FILE)
         if path.suffix.lower() == ".gz":

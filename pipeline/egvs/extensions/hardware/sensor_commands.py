@@ -353,6 +353,7 @@ def design(
         from egvs.cli import answer
         from egvs.extensions.hardware import design as sensor_design
         from egvs.extensions.hardware.fit import output
+        from egvs.sensors.sensor_table import format_sensor_table
 
         screen.flow_source = answer.flow_source(loaded)
 
@@ -380,7 +381,7 @@ def design(
         )
         if result.designed is not None:
             files.ensure_writable_folder(file)
-            table = output.format_sensor_table(name, sensor_design.sensor_table(result.designed.sensor))
+            table = format_sensor_table(name, sensor_design.sensor_table(result.designed.sensor))
             comment = f"# {result.designed.sensor.source}, for pole {result.pole} of {loaded.name}.\n"
             files.write_text(file, comment + table)
     print_design(result, file if result.designed is not None else None)

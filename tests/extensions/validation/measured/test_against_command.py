@@ -113,3 +113,21 @@ def test_points_of_kitti_are_sweeps(folder: Path, tmp_path: Path, run_egvs: Any)
     (tmp_path / "cut.bin").write_bytes(b"\0" * 30)
     code, _, error = run_egvs("validate", "--against", tmp_path / "cut.bin", *common)
     assert code == 2 and "expected records of 16 bytes" in error
+
+
+def test_world_and_pose_of_a_scenario(folder: Path, mini: Path, tmp_path: Path, run_egvs: Any) -> None:
+    """Over level ground far from the building, a site of a scenario sees what the fitted ground plane does."""
+    pose = twin.POSE
+    row = f"mast,-150,40,{pose.z_m},90,{pose.pitch_deg},{pose.roll_deg}"
+    (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg\n{row}\n", encoding="utf-8")
+    common = ("--against", folder, "--labels", folder, "--sensor", SENSOR, "--detector", "points", "--out")
+    simulated = []
+    for name, scenario in (("plane", ()), ("site", (mini, "--site", "mast"))):
+        code, printed, error = run_egvs("validate", *scenario, *common, tmp_path / name)
+        assert code == 0, error
+        values = json.loads((tmp_path / name / "against.json").read_text(encoding="utf-8"))
+        simulated.append([box["simulated"] for box in values["boxes"]])
+    assert "The world is that of" in printed and "the pose that of its site mast" in printed
+    assert np.abs(np.subtract(*simulated)).max() <= 0.05 * np.max(simulated)
+    code, _, error = run_egvs("validate", mini, "--site", "pole", *common, tmp_path / "none")
+    assert code == 2 and "--site: expected one of 1 sites, got 'pole'" in error

@@ -249,7 +249,8 @@ def to_json(comparison: Comparison) -> dict[str, Any]:
         "notes": list(sentences(comparison)),
         "boxes": [dict(zip(keys, box, strict=True)) for box in boxes],
     }
-    return _without_nan(values)
+    cleaned: dict[str, Any] = _without_nan(values)
+    return cleaned
 
 
 def _without_nan(value: Any) -> Any:
