@@ -118,7 +118,7 @@ def test_points_of_kitti_are_sweeps(folder: Path, tmp_path: Path, run_egvs: Any)
 def test_world_and_pose_of_a_scenario(folder: Path, mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     """Over level ground far from the building, a site of a scenario sees what the fitted ground plane does."""
     pose = twin.POSE
-    row = f"mast,-150,40,{pose.z_m},90,{pose.pitch_deg},{pose.roll_deg}"
+    row = f"mast,-80,40,{pose.z_m},90,{pose.pitch_deg},{pose.roll_deg}"
     (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg\n{row}\n", encoding="utf-8")
     common = ("--against", folder, "--labels", folder, "--sensor", SENSOR, "--detector", "points", "--out")
     simulated = []
