@@ -33,10 +33,10 @@ from egvs.extensions.hardware.fit.empty_scan import EmptyScanFit
 from egvs.extensions.hardware.fit.fit import SensorFit, fit_sensor
 from egvs.extensions.hardware.fit.range_noise import VARIANCE_FACTOR, range_residuals
 from egvs.extensions.hardware.fit.return_rates import ROAD_BAND_M
-from egvs.extensions.hardware.fit.sweep_files import read_sweeps
 from egvs.extensions.maps.point_clouds.as_built_view import AsBuiltMap
 from egvs.extensions.maps.point_clouds.reader import make_meshes
 from egvs.extensions.maps.point_clouds.surface import triangulate_cloud
+from egvs.formats.sweep_files import read_sweeps
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.sensors.sensor import Sensor, resolve_sensor
 from egvs.statistics.intervals import estimate_scale

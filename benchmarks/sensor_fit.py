@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.simulated_sweeps import Truth, simulate_sweep
 from egvs.core.wording import format_percent
 from egvs.extensions.hardware.fit.fit import SensorFit, fit_sensor
-from egvs.extensions.hardware.fit.sweep_files import Sweep
+from egvs.formats.sweep_files import Sweep
 from egvs.sensors.sensor import CATALOGUE, Sensor
 from egvs.statistics.intervals import Estimate
 

@@ -155,7 +155,7 @@ def write_npz(path: Path, mb: float) -> None:
 
 
 def read_npz(path: Path) -> object:
-    from egvs.extensions.hardware.fit.sweep_files import read_sweeps
+    from egvs.formats.sweep_files import read_sweeps
 
     return read_sweeps([path])
 

@@ -17,9 +17,12 @@ def lazy_exports(
     package
         The package: ``__name__`` in its ``__init__.py``.
     modules
-        Module, relative to the package, to the public names that it defines.
+        Module, relative to the package or, from ``egvs.`` on, in full, to the public names that it defines.
     """
-    module_of = {name: f"{package}.{module}" for module, names in modules.items() for name in names}
+    module_of = {}
+    for module, names in modules.items():
+        full_name = module if module.startswith("egvs.") else f"{package}.{module}"
+        module_of.update(dict.fromkeys(names, full_name))
 
     def get_attribute(name: str) -> Any:
         if name not in module_of:

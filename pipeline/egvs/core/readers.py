@@ -40,7 +40,7 @@ GROUP = "egvs.readers"
 FORMER_GROUPS = ("egvs.maps", "egvs.point_clouds", "egvs.tracks")
 """Groups of entry points that named readers before there was one table."""
 
-KINDS = ("map", "tracks", "points", "sweeps")
+KINDS = ("map", "tracks", "points", "sweeps", "labels")
 """What a file can hold."""
 
 HEAD_BYTES = 4096

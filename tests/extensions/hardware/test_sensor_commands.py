@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from egvs.extensions.hardware import sensor_commands as sensor
-from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
 from egvs.formats import ply
+from egvs.formats.recording_options import RecordingOptions
 from tests.extensions.hardware.fit.small_sensor import TRUTH, coarse_sensor, sweep_of
 from tests.extensions.hardware.recordings.ros_recordings import write_recording
 

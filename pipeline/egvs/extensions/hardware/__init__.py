@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from egvs.extensions.hardware.design_request import DesignRequest
     from egvs.extensions.hardware.fit.fit import fit_sensor
     from egvs.extensions.hardware.fit.output import write_fit
-    from egvs.extensions.hardware.fit.sweep_files import read_sweeps
     from egvs.extensions.hardware.installation.acceptance import accept
     from egvs.extensions.hardware.installation.acceptance_page import write_acceptance
     from egvs.extensions.hardware.installation.sheet import write_sheets
+    from egvs.formats.sweep_files import read_sweeps
 
 __all__ = [
     "DesignRequest",
@@ -43,7 +43,7 @@ __getattr__, __dir__ = lazy_exports(
         "design_request": ["DesignRequest"],
         "fit.fit": ["fit_sensor"],
         "fit.output": ["write_fit"],
-        "fit.sweep_files": ["read_sweeps"],
+        "egvs.formats.sweep_files": ["read_sweeps"],
         "installation.acceptance": ["accept"],
         "installation.acceptance_page": ["write_acceptance"],
         "installation.sheet": ["write_sheets"],

@@ -1,4 +1,4 @@
-"""Recordings with several sweeps of a LiDAR; see :mod:`egvs.extensions.hardware.fit.sweep_files`."""
+"""Recordings with several sweeps of a LiDAR; see :mod:`egvs.formats.sweep_files`."""
 
 from __future__ import annotations
 

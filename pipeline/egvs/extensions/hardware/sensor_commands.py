@@ -12,7 +12,7 @@ from egvs.cli.options import Detector, Jobs, Set, SettingsPath
 from egvs.core.errors import InputError
 from egvs.core.wording import format_percent
 from egvs.extensions.hardware.design_request import ALL_SENSORS, ELEVATION_BOUNDS_DEG, DesignRequest
-from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
+from egvs.formats.recording_options import RecordingOptions
 
 if TYPE_CHECKING:
     from egvs.extensions.hardware.design import Design, DesignResult
@@ -107,8 +107,9 @@ def fit(
     plugins.require_libraries("egvs sensor fit", "figure", "matplotlib")
     with ProgressDisplay("sensor fit") as screen:
         from egvs.extensions.hardware.fit import fit as fitting
-        from egvs.extensions.hardware.fit import output, sweep_files
+        from egvs.extensions.hardware.fit import output
         from egvs.extensions.hardware.fit.calibration import read_calibrated_pose
+        from egvs.formats import sweep_files
 
         if not name:
             raise InputError("--name", "no name is given", "Use --name north-mast.")
@@ -352,6 +353,7 @@ def design(
         from egvs.cli import answer
         from egvs.extensions.hardware import design as sensor_design
         from egvs.extensions.hardware.fit import output
+        from egvs.sensors.sensor_table import format_sensor_table
 
         screen.flow_source = answer.flow_source(loaded)
 
@@ -379,7 +381,7 @@ def design(
         )
         if result.designed is not None:
             files.ensure_writable_folder(file)
-            table = output.format_sensor_table(name, sensor_design.sensor_table(result.designed.sensor))
+            table = format_sensor_table(name, sensor_design.sensor_table(result.designed.sensor))
             comment = f"# {result.designed.sensor.source}, for pole {result.pole} of {loaded.name}.\n"
             files.write_text(file, comment + table)
     print_design(result, file if result.designed is not None else None)

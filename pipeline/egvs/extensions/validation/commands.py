@@ -9,7 +9,7 @@ import typer
 
 from egvs.cli import options, sources
 from egvs.cli.commands import Command
-from egvs.cli.options import Jobs, Out, ScenarioPath, Set, SettingsPath
+from egvs.cli.options import Jobs, Out, ScenarioPath, Set
 from egvs.core.errors import InputError, MissingBackendError
 
 DEFAULT_FRAMES = 250
@@ -26,7 +26,13 @@ Spacing = Annotated[
 
 
 def validate(
-    scenario: SettingsPath,
+    scenario: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="SCENARIO|RUN",
+            help="Scenario folder or its scenario.toml, or a run, to use its settings; optional with --against.",
+        ),
+    ] = None,
     out: Out = None,
     set_: Set = None,
     frames: Annotated[int, typer.Option(min=10, help=_FRAMES_HELP)] = DEFAULT_FRAMES,
@@ -54,11 +60,39 @@ def validate(
     plan_from: Annotated[
         Path | None, typer.Option("--plan-from", metavar="DIR", help="Validate the plan in another run's folder.")
     ] = None,
+    against: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="SWEEPS", help="Hold measured sweeps against the simulation: files or a folder."),
+    ] = None,
+    labels: Annotated[
+        list[Path] | None, typer.Option(metavar="LABELS", help="Labelled boxes of the sweeps: files or a folder.")
+    ] = None,
+    sensor: Annotated[str | None, typer.Option(metavar="NAME", help="Sensor of the sweeps.")] = None,
+    site: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Site of the scenario where the sensor stands.")
+    ] = None,
+    yaw: Annotated[
+        str | None,
+        typer.Option(metavar="CONVENTION", help="Headings of labels: x-ccw, x-cw, y-ccw or y-cw; by default, found."),
+    ] = None,
+    columns: Annotated[
+        str | None, typer.Option(metavar="VALUE=COLUMN,...", help="Columns of a table of labels, as type=class,x_m=cx.")
+    ] = None,
     jobs: Jobs = None,
 ) -> None:
-    """Simulate detection from each site, and test which score predicts it; or validate a plan."""
+    """Simulate detection from each site, and test which score predicts it; or validate a plan, or measured sweeps."""
     from egvs.cli.console import ProgressDisplay
 
+    of_sweeps = {"--labels": labels, "--sensor": sensor, "--site": site, "--yaw": yaw, "--columns": columns}
+    if against:
+        files = tuple(against), tuple(labels or ())
+        _validate_against(scenario, set_, out, files, sensor, site, yaw, columns, detector)
+        return
+    for option, value in of_sweeps.items():
+        if value is not None:
+            raise InputError(option, "only available with --against", "Add --against SWEEPS.")
+    if scenario is None:
+        raise InputError("SCENARIO", "expected a scenario or a run, got none", "Name one; or use --against SWEEPS.")
     of_plan = plan or plan_from is not None
     if of_plan and (detections is not None or keep):
         option = "--keep" if keep else "--detections"
@@ -86,6 +120,59 @@ def validate(
         validation_tables.print_plan_validation(plan_result)
     else:
         validation_tables.print_validation(loaded, folder, validation)
+
+
+def _validate_against(
+    scenario: Path | None,
+    set_: list[str] | None,
+    out: Path | None,
+    sweeps_and_labels: tuple[tuple[Path, ...], tuple[Path, ...]],
+    sensor: str | None,
+    site: str | None,
+    yaw: str | None,
+    columns: str | None,
+    detector: str,
+) -> None:
+    """Hold measured sweeps against the simulation, or without labels, against one another."""
+    from egvs.cli.console import ProgressDisplay
+    from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
+    from egvs.extensions.validation.measured import tables
+    from egvs.extensions.validation.measured.comparison import ComparisonRequest, compare_labelled, compare_unlabelled
+    from egvs.extensions.validation.measured.yaw_conventions import CONVENTIONS
+    from egvs.scenario.loading import load
+
+    sweeps, labels = sweeps_and_labels
+    if scenario is None and set_:
+        raise InputError("--set", "expected a scenario, got none", "Name the scenario.")
+    if yaw is not None and yaw not in CONVENTIONS:
+        raise InputError("--yaw", f"expected {', '.join(CONVENTIONS)}, got {yaw!r}", "Omit it to find it.")
+    named = [name.strip() for name in detector.split(",") if name.strip()]
+    detectors = tuple(name for name in dict.fromkeys(named) if name != POINT_COUNTS_NAME)
+    request = ComparisonRequest(sweeps, labels, sensor, site, yaw, columns=_column_names(columns), detectors=detectors)
+    loaded = None if scenario is None else load(scenario, set_ or ())
+    if not labels:
+        with ProgressDisplay("validate"):
+            repetition = compare_unlabelled(request, loaded)
+        tables.print_repetition(repetition)
+        return
+    with ProgressDisplay("validate"):
+        comparison = compare_labelled(request, loaded)
+    tables.print_comparison(comparison)
+    if out is not None:
+        for path in tables.write_comparison(comparison, out):
+            print(f"wrote {path}")
+
+
+def _column_names(text: str | None) -> dict[str, str]:
+    """Return the columns of ``--columns``."""
+    names: dict[str, str] = {}
+    for item in (text or "").split(","):
+        if item.strip():
+            value, separator, column = item.partition("=")
+            if not separator or not value.strip() or not column.strip():
+                raise InputError("--columns", f"expected VALUE=COLUMN, got {item!r}", "For example type=class,x_m=cx.")
+            names[value.strip()] = column.strip()
+    return names
 
 
 def clouds(

@@ -10,7 +10,7 @@ from benchmarks.simulated_sweeps import Truth, simulate_sweep
 
 from egvs.core.grid import FloatArray, IntArray
 from egvs.extensions.hardware.fit.fit import SensorFit, fit_sensor
-from egvs.extensions.hardware.fit.sweep_files import Sweep
+from egvs.formats.sweep_files import Sweep
 from egvs.sensors.sensor import Sensor
 
 ELEVATIONS_DEG = (-25.0, 3.0, -16.5, 1.0, -12.0, -9.0, -6.75, -5.0, -3.5, -1.25)

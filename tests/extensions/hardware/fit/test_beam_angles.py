@@ -14,7 +14,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.fit.beam_angles import fit_beam_angles, pulse_grid, range_step, share_offsets
 from egvs.extensions.hardware.fit.fit import fit_sensor
-from egvs.extensions.hardware.fit.sweep_files import Sweep
+from egvs.formats.sweep_files import Sweep
 from egvs.sensors.sensor import CATALOGUE
 from tests.extensions.hardware.fit.small_sensor import (
     ELEVATIONS_DEG,

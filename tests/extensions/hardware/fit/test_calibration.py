@@ -14,7 +14,7 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.extensions.hardware.fit.calibration import read_calibrated_pose
-from egvs.extensions.hardware.fit.ground_plane import GroundPlane
+from egvs.sensors.ground_plane import GroundPlane
 from egvs.sensors.sensor import rotation_world_sensor
 
 

@@ -19,7 +19,7 @@ from egvs.extensions.hardware.fit.beam_angles import fit_beam_angles
 from egvs.extensions.hardware.fit.calibration import read_calibrated_pose
 from egvs.extensions.hardware.fit.empty_scan import TRAFFIC
 from egvs.extensions.hardware.fit.fit import SensorFit, fit_sensor
-from egvs.extensions.hardware.fit.sweep_files import Sweep, read_sweeps
+from egvs.formats.sweep_files import Sweep, read_sweeps
 from egvs.sensors.sensor import CATALOGUE
 from egvs.statistics.intervals import Estimate
 from tests.extensions.hardware.fit.small_sensor import (

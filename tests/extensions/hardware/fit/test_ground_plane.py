@@ -10,7 +10,7 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.extensions.hardware.fit.ground_plane import find_ground_planes
+from egvs.sensors.ground_plane import find_ground_planes
 from egvs.sensors.sensor import rotation_world_sensor
 from tests.extensions.hardware.fit.small_sensor import TRUTH, small_fit
 

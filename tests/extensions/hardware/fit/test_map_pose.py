@@ -18,10 +18,10 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.fit import figures
 from egvs.extensions.hardware.fit.fit import fit_sensor
-from egvs.extensions.hardware.fit.ground_plane import GroundPlane
 from egvs.extensions.hardware.fit.map_pose import MapPose, fit_map_pose, lowest_surface_m
-from egvs.extensions.hardware.fit.sweep_files import Sweep
 from egvs.formats import ply
+from egvs.formats.sweep_files import Sweep
+from egvs.sensors.ground_plane import GroundPlane
 from egvs.sensors.sites import Pose
 from tests.conftest import collection, feature, write_mini
 from tests.extensions.hardware.fit.small_sensor import coarse_sensor, small_fit, sweep_of

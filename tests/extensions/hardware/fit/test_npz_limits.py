@@ -10,7 +10,7 @@ import pytest
 
 from egvs.core import limits
 from egvs.core.errors import InputError
-from egvs.extensions.hardware.fit.sweep_files import read_sweeps
+from egvs.formats.sweep_files import read_sweeps
 
 
 def test_npz_has_a_limit_before_it_is_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,8 +17,8 @@ from egvs.core.errors import InputError
 from egvs.extensions.hardware.fit import output
 from egvs.extensions.hardware.fit.empty_scan import TRAFFIC
 from egvs.extensions.hardware.fit.fit import SensorFit, fit_sensor
-from egvs.extensions.hardware.fit.sweep_files import Sweep
 from egvs.formats import point_clouds
+from egvs.formats.sweep_files import Sweep
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.sensors.sensor import resolve_sensor
 from tests.extensions.hardware.fit.small_sensor import ELEVATIONS_DEG, TRUTH, small_fit, small_sensor, sweep_of

@@ -12,8 +12,8 @@ import pytest
 
 from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.fit.rotation import fit_rotation, rotation_of_stamps
-from egvs.extensions.hardware.fit.sweep_files import Sweep
-from egvs.extensions.hardware.recordings.recordings import Recording
+from egvs.formats.recordings import Recording
+from egvs.formats.sweep_files import Sweep
 from tests.extensions.hardware.fit.small_sensor import TRUTH, coarse_sensor, small_fit, sweep_of
 
 AZIMUTHS, CHANNELS = 300, 10

@@ -14,8 +14,8 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.extensions.hardware.fit.sweep_files import read_sweeps
 from egvs.formats import pcd, ply
+from egvs.formats.sweep_files import read_sweeps
 
 MISSING = (0, 7, 2999)
 

@@ -17,10 +17,10 @@ from egvs.core import plugins
 from egvs.core.errors import EgvsError, InputError
 from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.fit.fit import fit_sensor
-from egvs.extensions.hardware.fit.sweep_files import read_sweeps
 from egvs.extensions.hardware.recordings import ros_bags, velodyne_pcap
-from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
-from egvs.extensions.hardware.recordings.recordings import chosen_sweeps, ring_numbers, sweep_blocks
+from egvs.formats.recording_options import RecordingOptions
+from egvs.formats.recordings import chosen_sweeps, ring_numbers, sweep_blocks
+from egvs.formats.sweep_files import read_sweeps
 from tests.extensions.hardware.fit.small_sensor import TRUTH, coarse_sensor, sweep_of
 from tests.extensions.hardware.recordings.ros_recordings import TOPIC, write_recording
 from tests.extensions.hardware.recordings.velodyne_packets import ELEVATIONS_DEG, packets, write_pcap

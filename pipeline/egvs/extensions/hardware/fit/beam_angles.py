@@ -25,8 +25,8 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.wording import format_percent
-from egvs.extensions.hardware.fit.sweep_files import Sweep
 from egvs.extensions.hardware.fit.sweep_layout import Layout, axis_distances_m, find_layout, fit_cone, nearest_ring
+from egvs.formats.sweep_files import Sweep
 
 _OFFSET_ROUNDING_M = 1e-5
 """Offsets are not more exact than this."""

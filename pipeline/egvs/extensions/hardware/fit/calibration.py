@@ -25,7 +25,7 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import read_json
-from egvs.extensions.hardware.fit.ground_plane import GroundPlane
+from egvs.sensors.ground_plane import GroundPlane
 from egvs.sensors.sites import Pose
 
 _PREFIX = "transformation_matrix_into_"

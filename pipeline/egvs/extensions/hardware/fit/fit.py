@@ -9,18 +9,19 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.extensions.hardware.fit import empty_scan, ground_plane, range_noise, return_rates
+from egvs.extensions.hardware.fit import empty_scan, range_noise, return_rates
 from egvs.extensions.hardware.fit.beam_angles import BeamAngles, PulseGrid, fit_beam_angles, pulse_grid, range_step
 from egvs.extensions.hardware.fit.calibration import CalibratedPose
 from egvs.extensions.hardware.fit.empty_scan import EmptyScanFit
-from egvs.extensions.hardware.fit.ground_plane import GroundPlane
 from egvs.extensions.hardware.fit.map_pose import MapPose, fit_map_pose
 from egvs.extensions.hardware.fit.range_noise import NoiseBin, RangeResiduals
 from egvs.extensions.hardware.fit.return_rates import PlaneView, RateBin
 from egvs.extensions.hardware.fit.rotation import Rotation, fit_rotation
 from egvs.extensions.hardware.fit.surface_normals import surface_normals
-from egvs.extensions.hardware.fit.sweep_files import Sweep
+from egvs.formats.sweep_files import Sweep
 from egvs.scenario.model import Scenario
+from egvs.sensors import ground_plane
+from egvs.sensors.ground_plane import GroundPlane
 from egvs.stages.inputs import Inputs
 from egvs.statistics.intervals import Estimate, estimate_scale
 

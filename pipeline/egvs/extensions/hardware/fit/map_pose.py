@@ -14,7 +14,6 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
-from egvs.extensions.hardware.fit.ground_plane import GroundPlane
 from egvs.extensions.hardware.registration import (
     Registration,
     StaticSurfaces,
@@ -23,6 +22,7 @@ from egvs.extensions.hardware.registration import (
     sample_points,
     search_yaw,
 )
+from egvs.sensors.ground_plane import GroundPlane
 from egvs.sensors.sites import Pose
 from egvs.statistics.blocks import clustered_mean_se
 from egvs.world.mesh import World

@@ -20,13 +20,14 @@ from egvs.core.wording import format_percent
 from egvs.extensions.hardware.fit import empty_scan, figures
 from egvs.extensions.hardware.fit.calibration import CalibratedPose
 from egvs.extensions.hardware.fit.fit import SensorFit
-from egvs.extensions.hardware.fit.ground_plane import GroundPlane
 from egvs.extensions.hardware.fit.map_pose import MapPose
 from egvs.extensions.hardware.fit.range_noise import NoiseBin
 from egvs.extensions.hardware.registration import PARAMETERS
 from egvs.formats import pcd, ply
 from egvs.scenario.sensor_config import SensorConfig
+from egvs.sensors.ground_plane import GroundPlane
 from egvs.sensors.sensor import rotation_world_sensor
+from egvs.sensors.sensor_table import format_sensor_table
 from egvs.statistics.intervals import Estimate
 
 SENSOR_FILE, REPORT_FILE = "sensor.toml", "fit.json"
@@ -34,7 +35,6 @@ EMPTY_SCAN_FILE, LABELS_FILE = "empty_scan.pcd", "returns.ply"
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]{0,63}")
 _ANGLE_DIGITS = 4
-_LINE = 110
 
 
 @dataclass(frozen=True)
@@ -192,25 +192,6 @@ def calibration_lines(calibrated: CalibratedPose) -> list[str]:
         f"the chosen ground plane in {calibrated.frame}: z = {calibrated.ground_z_m:.2f} m below the sensor, tilted by "
         f"{calibrated.ground_tilt_deg:.2f} degrees",
     ]
-
-
-def format_sensor_table(name: str, table: dict[str, Any]) -> str:
-    """Return the lines of ``[sensors.NAME]`` with these keys."""
-    key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else f'"{name}"'
-    lines = [f"[sensors.{key}]"]
-    for entry, value in table.items():
-        if not isinstance(value, list) or len(value) <= 2:
-            lines.append(f"{entry} = {value!r}")
-            continue
-        lines.append(f"{entry} = [")
-        line = "   "
-        for number in value:
-            if len(line) > _LINE:
-                lines.append(line)
-                line = "   "
-            line += f" {number!r},"
-        lines += [line, "]"]
-    return "\n".join(lines) + "\n"
 
 
 # ---- the report

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.fit.beam_angles import BeamAngles
-from egvs.extensions.hardware.fit.ground_plane import GroundPlane
 from egvs.extensions.hardware.fit.range_noise import MAX_SLOPE
 from egvs.extensions.hardware.fit.surface_normals import incidence_angles_deg
+from egvs.sensors.ground_plane import GroundPlane
 from egvs.statistics.intervals import MIN_VALUES, Estimate, estimate_share
 
 RANGE_EDGES_M = (

@@ -23,7 +23,7 @@ import numpy as np
 
 from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.fit.beam_angles import BeamAngles, nearest_channels
-from egvs.extensions.hardware.fit.sweep_files import Sweep
+from egvs.formats.sweep_files import Sweep
 from egvs.statistics.blocks import jackknife_variance
 
 MIN_RATE_HZ, MAX_RATE_HZ = 1.0, 60.0

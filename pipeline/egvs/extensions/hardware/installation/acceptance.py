@@ -28,12 +28,12 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import format_percent, number_of
 from egvs.explore.session import Session
 from egvs.extensions.hardware import registration
-from egvs.extensions.hardware.fit import sweep_files
 from egvs.extensions.hardware.installation import scan_comparison
 from egvs.extensions.hardware.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M, Limits
 from egvs.extensions.hardware.installation.planned_sites import PlannedSites
 from egvs.extensions.hardware.installation.scan_comparison import BlockedSector, ScanComparison, StaticWorld
 from egvs.extensions.hardware.registration import PARAMETERS, Registration, StaticSurfaces, parameter_name_and_unit
+from egvs.formats import sweep_files
 from egvs.results.labels import SCORE_LABELS
 from egvs.scoring.visibility import Beams
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
@@ -308,7 +308,7 @@ def accept(
     site
         Name of the site. If it is part of the plan in the folder, its pose there is the planned one.
     scans
-        Files of measured scans in the sensor's frame, see :func:`egvs.extensions.hardware.fit.sweep_files.read_sweeps`.
+        Files of measured scans in the sensor's frame, see :func:`egvs.formats.sweep_files.read_sweeps`.
     limits
         The limits; by default :class:`Limits`.
     max_vehicle_height_m

@@ -5,7 +5,7 @@ A recording is a ``.bag`` (ROS 1), an ``.mcap`` or ``.db3`` (ROS 2), or the fold
 float64, metres) may be anywhere in a point; missing returns are NaN. Times of points are read from the first of these
 fields that exists: ``time``, ``timestamp``, ``t``, ``offset_time``, ``time_stamp``; floating point numbers are seconds,
 integers nanoseconds; rings from the first of
-:data:`egvs.extensions.hardware.recordings.recordings.RING_FIELDS`. No ROS installation is needed.
+:data:`egvs.formats.recordings.RING_FIELDS`. No ROS installation is needed.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ import numpy as np
 from egvs.core import limits, plugins
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
-from egvs.extensions.hardware.recordings.recordings import (
+from egvs.formats.reader_process import Block, serve
+from egvs.formats.recording_options import RecordingOptions
+from egvs.formats.recordings import (
     RING_FIELDS,
     RecordedSweep,
     Recording,
@@ -30,7 +31,6 @@ from egvs.extensions.hardware.recordings.recordings import (
     read_recording,
     sweep_blocks,
 )
-from egvs.formats.reader_process import Block, serve
 
 _CANNOT_READ = "cannot be read as a recording of ROS"
 _TYPE = "sensor_msgs/msg/PointCloud2"

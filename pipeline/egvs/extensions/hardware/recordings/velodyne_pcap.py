@@ -19,8 +19,9 @@ import numpy as np
 from egvs.core import limits, plugins
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
-from egvs.extensions.hardware.recordings.recordings import (
+from egvs.formats.reader_process import Block, serve
+from egvs.formats.recording_options import RecordingOptions
+from egvs.formats.recordings import (
     RecordedSweep,
     Recording,
     chosen_sweeps,
@@ -29,7 +30,6 @@ from egvs.extensions.hardware.recordings.recordings import (
     read_recording,
     sweep_blocks,
 )
-from egvs.formats.reader_process import Block, serve
 
 _CANNOT_READ = "cannot be read as a capture of a Velodyne sensor"
 _TIME, _COLUMN, _RING = 4, 5, 6

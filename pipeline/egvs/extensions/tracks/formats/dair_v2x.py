@@ -26,6 +26,7 @@ from egvs.core.wording import number_of
 from egvs.extensions.tracks.boxes import Box, BoxRows, ClassNames, Pose, is_rotation
 from egvs.extensions.tracks.formats.documents import Node, read_document
 from egvs.extensions.tracks.model import TrackFrame, Tracks
+from egvs.formats.sweep_labels import LabelOptions, SweepLabels, sweep_name
 
 _INDEX_FILE = "data_info.json"
 _LABEL_FOLDER, _CALIBRATION_FOLDER = "virtuallidar", "virtuallidar_to_world"
@@ -99,6 +100,32 @@ def read(path: Path) -> Tracks:
     if without_label:
         sources.append(f"sweeps without a label file left out: {without_label:,}")
     return rows.to_tracks(TrackFrame(), [*sources, *classes.sentences()])
+
+
+def read_labels(path: Path, _options: LabelOptions) -> list[SweepLabels]:
+    """Return the boxes of one label file in the frame of the LiDAR.
+
+    Files of this form are written by many tools, with headings of different conventions.
+    """
+    classes = ClassNames(_CLASSES, _STATIC)
+    names, kinds, boxes = [], [], []
+    tracked = True
+    for index, item in enumerate(read_document(path).elements()):
+        cls = classes.convert(item.get("type").text())
+        if cls is None:
+            continue
+        track = item.find("track_id")
+        is_tracked = track is not None and track.value not in ("", "-1", -1)
+        tracked &= is_tracked
+        names.append(str(track.value)[:80] if track is not None and is_tracked else f"{sweep_name(path)}-{index}")
+        kinds.append(cls)
+        box = _box(item, Pose())
+        boxes.append((box.x_m, box.y_m, box.z_m, box.length_m, box.width_m, box.height_m, box.yaw_rad))
+    array = np.array(boxes, dtype=np.float64).reshape(-1, 7)
+    labels = SweepLabels(
+        path, sweep_name(path), tuple(names), tuple(kinds), array, has_tracks=tracked, states_yaw=False
+    )
+    return [labels]
 
 
 def _folder(path: Path) -> Path:

@@ -33,6 +33,7 @@ from egvs.extensions.tracks.boxes import Box, BoxRows, ClassNames, Pose, front_o
 from egvs.extensions.tracks.formats.documents import Node, read_document
 from egvs.extensions.tracks.formats.openlabel_poses import SystemPose, pose_in_station, pose_in_world
 from egvs.extensions.tracks.model import TrackFrame, Tracks
+from egvs.formats.sweep_labels import LabelOptions, SweepLabels, sweep_name
 
 _SWEEP_NAME = re.compile(r"(\d{9,11})_(\d{1,9})_(.+)\.json(\.gz)?")
 _MAX_LENGTH_ERROR = 0.01
@@ -74,6 +75,51 @@ def read(path: Path) -> Tracks:
     return recording.to_tracks()
 
 
+def read_labels(path: Path, _options: LabelOptions) -> list[SweepLabels]:
+    """Return the boxes of each frame of a file as they are written, in the frame of the sensor.
+
+    InputError for cuboids in a coordinate system that is not that of a sensor.
+    """
+    root = read_document(path).get("openlabel")
+    classes = ClassNames(_CLASSES, _STATIC)
+    match = _SWEEP_NAME.fullmatch(path.name)
+    labels = []
+    for _, frame in root.get("frames").members():
+        properties = frame.find("frame_properties")
+        time = None if properties is None else properties.find("timestamp")
+        file = None if properties is None else properties.find("point_cloud_file_name")
+        names, kinds, boxes = [], [], []
+        for name, item, cuboid, is_tumtraf in _cuboids(frame, Counter()):
+            cls = classes.convert(_type_of(root, name, item, is_tumtraf))
+            if cls is None:
+                continue
+            system = cuboid.find("coordinate_system")
+            _check_in_sensor(root, system)
+            box = _box(cuboid.get("val"), Pose())
+            names.append(name)
+            kinds.append(cls)
+            boxes.append((box.x_m, box.y_m, box.z_m, box.length_m, box.width_m, box.height_m, box.yaw_rad))
+        time_s = math.nan if time is None else time.number()
+        if time is None and match is not None:
+            time_s = int(match[1]) + int(match[2]) * 1e-9
+        sweep = sweep_name(path if file is None else file.text())
+        array = np.array(boxes, dtype=np.float64).reshape(-1, 7)
+        labels.append(SweepLabels(path, sweep, tuple(names), tuple(kinds), array, time_s))
+    return labels
+
+
+def _check_in_sensor(root: Node, system: Node | None) -> None:
+    """Raise an InputError for a coordinate system that is declared as another than a sensor's."""
+    if system is None:
+        return
+    systems = root.find("coordinate_systems")
+    declared = None if systems is None else systems.find(system.text())
+    kind = None if declared is None else declared.find("type")
+    if kind is not None and kind.value not in ("sensor_cs", "sensor"):
+        problem = f"expected boxes in the sensor's frame, got the system {system.text()[:80]!r} of type {kind.value!r}"
+        raise system.error(problem, "Export the labels in the frame of the sweeps.")
+
+
 def _sweeps(path: Path) -> list[Path]:
     match = _SWEEP_NAME.fullmatch(path.name)
     if match is None:
@@ -112,7 +158,7 @@ class _Recording:
             else:
                 raise frame.error("frame_properties.timestamp is missing", "Add the time of the frame in seconds.")
             poses: dict[tuple[str, bool], SystemPose] = {}
-            for name, item, cuboid, is_tumtraf in self._cuboids(frame):
+            for name, item, cuboid, is_tumtraf in _cuboids(frame, self._counts):
                 cls = self._classes.convert(_type_of(root, name, item, is_tumtraf))
                 if cls is None:
                     continue
@@ -128,21 +174,6 @@ class _Recording:
                     self._counts["bottoms"] += 1
                 self._counts["without yaw"] += is_tumtraf and cuboid.get("val").value[3:6] == [0, 0, 0]
                 self._rows.add(file, name, cls, time_s, box)
-
-    def _cuboids(self, frame: Node) -> Iterator[tuple[str, Node, Node, bool]]:
-        """Yield the track, the object, its cuboid, and whether it is TUMTraf's dialect, of all objects of a frame."""
-        objects = frame.find("objects")
-        for name, item in objects.members() if objects is not None else ():
-            data = item.find("object_data")
-            cuboid = None if data is None else data.find("cuboid")
-            if cuboid is None or cuboid.value == []:
-                self._counts["no cuboid"] += 1
-            elif isinstance(cuboid.value, list):
-                first, *others = cuboid.elements()
-                self._counts["further cuboids"] += len(others)
-                yield name, item, first, False
-            else:
-                yield name, item, cuboid, True
 
     def to_tracks(self) -> Tracks:
         """Return the tracks; InputError unless all are in one coordinate system."""
@@ -170,6 +201,25 @@ class _Recording:
             yield f"objects without a cuboid left out: {self._counts['no cuboid']:,}"
         if self._counts["further cuboids"]:
             yield f"further cuboids of the same object left out: {self._counts['further cuboids']:,}"
+
+
+def _cuboids(frame: Node, counts: Counter[str]) -> Iterator[tuple[str, Node, Node, bool]]:
+    """Yield the track, the object, its cuboid, and whether it is TUMTraf's dialect, of all objects of a frame.
+
+    ``counts`` counts what is left out.
+    """
+    objects = frame.find("objects")
+    for name, item in objects.members() if objects is not None else ():
+        data = item.find("object_data")
+        cuboid = None if data is None else data.find("cuboid")
+        if cuboid is None or cuboid.value == []:
+            counts["no cuboid"] += 1
+        elif isinstance(cuboid.value, list):
+            first, *others = cuboid.elements()
+            counts["further cuboids"] += len(others)
+            yield name, item, first, False
+        else:
+            yield name, item, cuboid, True
 
 
 def _type_of(root: Node, name: str, item: Node, is_tumtraf: bool) -> str:

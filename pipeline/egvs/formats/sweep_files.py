@@ -10,7 +10,7 @@ Recordings of ROS (:mod:`egvs.extensions.hardware.recordings.ros_bags`) and netw
 
 Nothing in a file's header says how its points are ordered; :mod:`egvs.extensions.hardware.fit.sweep_layout` finds out.
 Many files say of each point which ring it is from
-(:data:`egvs.extensions.hardware.recordings.recordings.RING_FIELDS`).
+(:data:`egvs.formats.recordings.RING_FIELDS`).
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from egvs.core import files, limits, readers
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.reading import COMPLETE_FILE
-from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
-from egvs.extensions.hardware.recordings.recordings import RING_FIELDS, RecordedSweep, Recording, ring_numbers
 from egvs.formats import point_clouds
+from egvs.formats.recording_options import RecordingOptions
+from egvs.formats.recordings import RING_FIELDS, RecordedSweep, Recording, chosen_sweeps, ring_numbers
 
 MIN_RETURNS = 2000
 """Fewest returns of a sweep; sensors with rings have 30,000 or more."""
@@ -62,6 +62,8 @@ class Sweep:
         The recording that the sweep is of; None for a file of one sweep.
     ring
         Which ring each point is from, (n,) int64; None if the file does not say.
+    stamp_s
+        When it was recorded, seconds on the recording's clock; None for a file of one sweep.
     """
 
     name: str
@@ -70,6 +72,7 @@ class Sweep:
     time_s: FloatArray | None = None
     recording: Recording | None = None
     ring: IntArray | None = None
+    stamp_s: float | None = None
 
     @property
     def returns(self) -> int:
@@ -83,8 +86,8 @@ def read_sweeps(paths: Sequence[str | Path], options: RecordingOptions | None = 
     Parameters
     ----------
     paths
-        Files with the suffix .pcd, .ply, .las, .laz, .csv, .e57 or .npz, or of a format that an installed package adds;
-        also with .gz after it. Or recordings: .bag, .mcap, .db3, the folder of a ROS 2 recording, or .pcap.
+        Files with the suffix .pcd, .ply, .las, .laz, .csv, .e57, .bin or .npz, or of a format that an installed package
+        adds; also with .gz after it. Or recordings: .bag, .mcap, .db3, the folder of a ROS 2 recording, or .pcap.
     options
         What is read of recordings.
 
@@ -99,7 +102,8 @@ def read_sweeps(paths: Sequence[str | Path], options: RecordingOptions | None = 
     for path in map(Path, paths):
         reader = _recording_reader(path)
         if reader is not None:
-            sweeps += _recorded(*reader.read(path, path.name, options))
+            recording, recorded = reader.read(path, path.name, options)
+            sweeps += _recorded(recording, recorded, options)
             continue
         limits.checked_size(path, limits.FILE)
         if path.suffix.lower() == ".gz":
@@ -126,11 +130,14 @@ def _recording_reader(path: Path) -> Any:
     return None
 
 
-def _recorded(recording: Recording, recorded: list[RecordedSweep]) -> Iterator[Sweep]:
-    for sweep in recorded:
+def _recorded(recording: Recording, recorded: list[RecordedSweep], options: RecordingOptions) -> Iterator[Sweep]:
+    stamps_s = recording.stamps_s[chosen_sweeps(recording.sweeps, options.max_sweeps)].tolist()
+    if len(stamps_s) != len(recorded):  # of a network capture, sweeps are dropped while it is decoded
+        stamps_s = [None] * len(recorded)
+    for sweep, stamp_s in zip(recorded, stamps_s, strict=True):
         points_m = _clean_sweep(sweep.label, sweep.points_m).points_m
         name = f"{recording.name}: {sweep.label}"
-        yield Sweep(name, points_m, time_s=sweep.time_s, recording=recording, ring=sweep.ring)
+        yield Sweep(name, points_m, time_s=sweep.time_s, recording=recording, ring=sweep.ring, stamp_s=stamp_s)
 
 
 def _read_gzip(path: Path) -> list[Sweep]:

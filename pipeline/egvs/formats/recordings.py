@@ -17,8 +17,8 @@ import numpy as np
 
 from egvs.core import limits
 from egvs.core.grid import FloatArray, IntArray
-from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
 from egvs.formats.reader_process import Block, read_blocks
+from egvs.formats.recording_options import RecordingOptions
 
 RING_FIELDS = ("ring", "channel", "laser_id")
 """Names of the field that says which ring a point is from; the first that a file has counts."""

@@ -1,0 +1,1 @@
+"""Labelled sweeps of an installed LiDAR, held against the simulation of the same boxes."""

@@ -1,0 +1,149 @@
+r"""Fit the return model of a sensor to the points on labelled vehicles.
+
+The simulation says at which ranges :math:`r_b` the beams of the sensor meet a vehicle, without losses. With the model
+of :mod:`egvs.sensors.return_model`, it has
+
+.. math:: \mu_i = (1 - d) \sum_b \Phi\!\left( \frac{2 \ln(r_{max} / r_b)}{s} \right)
+
+points. :math:`r_{max}` and the softness s minimise the deviance of the measured points :math:`m_i` from Poisson's
+distribution, :math:`2 \sum_i m_i \ln(m_i / \mu_i) - (m_i - \mu_i)`, on a grid. Only its minimum is taken from Poisson:
+paint and the fit of boxes scatter more, so standard errors come from leaving out one object at a time, in all sweeps
+(of many objects, one of :data:`MOST_GROUPS` groups).
+The dropout d cannot be told from a shorter range, and stays that of the sensor. Where the vehicles do not show the
+softness (too few objects, or one range), it stays that of the sensor, too.
+
+The rated range follows from :math:`r_{max}` with the reflectivity of cars: range and reflectivity cannot be told apart.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from egvs.core.grid import FloatArray, IntArray
+from egvs.core.special import ndtr
+from egvs.sensors.return_model import ReturnModel
+from egvs.statistics.blocks import jackknife_variance
+
+LIMITS_M: FloatArray = np.exp(np.linspace(math.log(4.0), math.log(600.0), 502))
+"""Tried values of r_max, one per cent apart."""
+
+SOFTNESSES: FloatArray = np.round(np.arange(0.2, 4.01, 0.1), 2)
+
+MIN_OBJECTS = 5
+"""Fewest objects with a fit."""
+
+MOST_GROUPS = 100
+
+MIN_OBJECTS_SOFTNESS = 8
+MAX_SOFTNESS_ERROR = 0.25
+"""The softness is fitted if its relative standard error is at most this."""
+
+_BIN_M = 0.5
+_FEW = 1e-6
+
+
+@dataclass(frozen=True)
+class ReturnFit:
+    """A fitted return model.
+
+    Attributes
+    ----------
+    limit_m, limit_se
+        Range at which half of the returns from cars are lost, and the standard error of its logarithm.
+    softness, softness_se
+        The softness and its standard error; 0 where it is that of the sensor.
+    dropout
+        That of the sensor.
+    rated_range_m
+        Rated range for the sensor's rated reflectivity, by the reflectivity of cars.
+    vehicles, objects
+        Number of boxes, and of objects that they are of.
+    """
+
+    limit_m: float
+    limit_se: float
+    softness: float
+    softness_se: float
+    dropout: float
+    rated_range_m: float
+    vehicles: int
+    objects: int
+
+    @property
+    def limit_interval_m(self) -> tuple[float, float]:
+        """Interval of two standard errors."""
+        return self.limit_m * math.exp(-2 * self.limit_se), self.limit_m * math.exp(2 * self.limit_se)
+
+    @property
+    def softness_interval(self) -> tuple[float, float]:
+        """Interval of two standard errors."""
+        return max(self.softness - 2 * self.softness_se, 0.0), self.softness + 2 * self.softness_se
+
+
+def fit_returns(
+    measured: IntArray, owner: IntArray, range_m: FloatArray, weight: FloatArray, objects: IntArray, model: ReturnModel
+) -> ReturnFit | None:
+    """Return the fit; None with fewer than :data:`MIN_OBJECTS` objects.
+
+    Parameters
+    ----------
+    measured
+        Points on each vehicle, (n,) int64.
+    owner, range_m, weight
+        Vehicle that each beam meets, its range without losses, and its share, (beams,).
+    objects
+        Object that each vehicle is of, (n,) int64.
+    model
+        The losses of the sensor as it is.
+    """
+    numbers, of_object = np.unique(objects, return_inverse=True)
+    if len(numbers) < MIN_OBJECTS or not measured.sum():
+        return None
+
+    group = of_object % MOST_GROUPS
+    deviance = np.zeros((min(len(numbers), MOST_GROUPS), len(SOFTNESSES), len(LIMITS_M)))
+    for vehicle, count in enumerate(measured.tolist()):
+        beams = owner == vehicle
+        expected = (1.0 - model.dropout) * _expected_points(range_m[beams], weight[beams])
+        deviance[group[vehicle]] += _deviance(count, expected)
+
+    limit, softness = _minimum(deviance.sum(axis=0))
+    left_out = np.array([_minimum(deviance.sum(axis=0) - one) for one in deviance])
+    softness_se = math.sqrt(float(jackknife_variance(left_out[:, 1])))
+    at_edge = softness in (SOFTNESSES[0], SOFTNESSES[-1])
+    if len(numbers) < MIN_OBJECTS_SOFTNESS or at_edge or softness_se > MAX_SOFTNESS_ERROR * softness:
+        fixed = int(np.argmin(np.abs(SOFTNESSES - model.softness)))
+        row = deviance[:, fixed : fixed + 1]
+        limit, softness, softness_se = _minimum(row.sum(axis=0))[0], float(SOFTNESSES[fixed]), 0.0
+        left_out = np.array([_minimum(row.sum(axis=0) - one) for one in row])
+    limit_se = math.sqrt(float(jackknife_variance(np.log(left_out[:, 0]))))
+    rated_m = limit / model.limit_m(model.target_reflectivity()) * model.rated_range_m
+    return ReturnFit(limit, limit_se, softness, softness_se, model.dropout, rated_m, len(measured), len(numbers))
+
+
+def _expected_points(range_m: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the points on a vehicle without dropout, whose beams have these ranges, (softnesses, limits) float64."""
+    bins, of_bin = np.unique(np.floor(range_m / _BIN_M), return_inverse=True)
+    beams = np.bincount(of_bin, weights=weight, minlength=len(bins))
+    expected = np.zeros((len(SOFTNESSES), len(LIMITS_M)))
+    for at_m, count in zip(((bins + 0.5) * _BIN_M).tolist(), beams.tolist(), strict=True):
+        expected += count * ndtr(2.0 * np.log(LIMITS_M / at_m)[None, :] / SOFTNESSES[:, None])
+    return expected
+
+
+def _deviance(count: int, expected: FloatArray) -> FloatArray:
+    """Return Poisson's deviance of a count from each expected value, of the shape of ``expected``."""
+    mean = np.maximum(expected, _FEW)
+    logarithm = count * np.log(count / mean) if count else 0.0
+    deviance: FloatArray = 2.0 * (logarithm - (count - mean))
+    return deviance
+
+
+def _minimum(deviance: FloatArray) -> tuple[float, float]:
+    """Return the limit and the softness with the smallest deviance, (softnesses, limits)."""
+    row, column = np.unravel_index(int(np.argmin(deviance)), deviance.shape)
+    softness = SOFTNESSES[row] if len(deviance) > 1 else math.nan
+    return float(LIMITS_M[column]), float(softness)
