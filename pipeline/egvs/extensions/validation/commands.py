@@ -151,6 +151,9 @@ def _validate_against(
     request = ComparisonRequest(sweeps, labels, sensor, site, yaw, columns=_column_names(columns), detectors=detectors)
     loaded = None if scenario is None else load(scenario, set_ or ())
     if not labels:
+        for option, value in (("--out", out), ("--site", site), ("--yaw", yaw), ("--columns", columns)):
+            if value is not None:
+                raise InputError(option, "only available with labels", f"Add --labels LABELS, or omit {option}.")
         with ProgressDisplay("validate"):
             repetition = compare_unlabelled(request, loaded)
         tables.print_repetition(repetition)

@@ -61,6 +61,24 @@ def test_known_losses_are_within_the_printed_interval(compared: Comparison) -> N
     assert fit.rated_range_m == pytest.approx(LOSSES.rated_range_m, rel=0.1)
 
 
+@pytest.mark.slow
+def test_intervals_contain_known_losses(tmp_path: Path) -> None:
+    """Of ten twins of 40 cars, two standard errors contain the limit and the softness of at least eight."""
+    limits = softnesses = 0
+    for seed in range(10, 20):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        sweeps = twin.make_twin(LOSSES, seed, sweeps=2)
+        labels = tuple(twin.write_openlabel(folder, sweeps))
+        fit = compare_labelled(ComparisonRequest(tuple(twin.write_pcd(folder, sweeps)), labels, SENSOR)).fit
+        assert fit is not None and 0.0 < fit.limit_se < 0.03
+        low_m, high_m = fit.limit_interval_m
+        limits += low_m < LOSSES.limit_m(0.03) < high_m
+        low, high = fit.softness_interval
+        softnesses += low < LOSSES.softness < high
+    assert limits >= 8 and softnesses >= 8
+
+
 def test_points_by_range(compared: Comparison) -> None:
     cars, *by_range = compared.rows
     assert (cars.label, cars.boxes, cars.objects) == ("car", 60, 60)

@@ -36,7 +36,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import ndtr
 from egvs.core.wording import format_percent
-from egvs.extensions.validation.measured.return_fit import LIMITS_M
+from egvs.extensions.validation.measured.return_fit import LIMITS_M, minima_of_limit
 from egvs.extensions.validation.measured.sensor_site import SensorSite
 from egvs.formats.sweep_files import Sweep
 from egvs.sensors.sensor import rotation_world_sensor
@@ -179,11 +179,10 @@ def _fit_ground(site: SensorSite, points_m: FloatArray, repeated: NDArray[np.boo
     azimuth_deg = np.degrees(np.arctan2(points_m[:, 1], points_m[:, 0])) + 180.0
     sector = np.unique(np.floor(azimuth_deg / _SECTOR_DEG), return_inverse=True)[1].astype(np.int64)
     deviance = _deviances(distance_m, repeated, sector)
-    limit_m = LIMITS_M[int(np.argmin(deviance.sum(axis=0)))]
-    left_out = np.array([LIMITS_M[int(np.argmin(deviance.sum(axis=0) - one))] for one in deviance])
-    se = math.sqrt(float(jackknife_variance(np.log(left_out))))
+    log_limit, left_out = minima_of_limit(deviance.sum(axis=0), deviance)
+    se = math.sqrt(float(jackknife_variance(left_out)))
     scale = math.sqrt(site.sensor.rated_reflectivity / REFLECTIVITY["ground"])
-    return GroundFit(float(limit_m) * scale, se, len(range_m))
+    return GroundFit(math.exp(log_limit) * scale, se, len(range_m))
 
 
 def _deviances(distance_m: FloatArray, repeated: NDArray[np.bool_], sector: IntArray) -> FloatArray:

@@ -6,9 +6,9 @@ of :mod:`egvs.sensors.return_model`, it has
 .. math:: \mu_i = (1 - d) \sum_b \Phi\!\left( \frac{2 \ln(r_{max} / r_b)}{s} \right)
 
 points. :math:`r_{max}` and the softness s minimise the deviance of the measured points :math:`m_i` from Poisson's
-distribution, :math:`2 \sum_i m_i \ln(m_i / \mu_i) - (m_i - \mu_i)`, on a grid. Only its minimum is taken from Poisson:
-paint and the fit of boxes scatter more, so standard errors come from leaving out one object at a time, in all sweeps
-(of many objects, one of :data:`MOST_GROUPS` groups).
+distribution, :math:`2 \sum_i m_i \ln(m_i / \mu_i) - (m_i - \mu_i)`: the best of a grid, then Newton's step. Only its
+minimum is taken from Poisson: paint and the fit of boxes scatter more, so standard errors come from leaving out one
+object at a time, in all sweeps (of many objects, one of :data:`MOST_GROUPS` groups).
 The dropout d cannot be told from a shorter range, and stays that of the sensor. Where the vehicles do not show the
 softness (too few objects, or one range), it stays that of the sensor, too.
 
@@ -27,10 +27,11 @@ from egvs.core.special import ndtr
 from egvs.sensors.return_model import ReturnModel
 from egvs.statistics.blocks import jackknife_variance
 
-LIMITS_M: FloatArray = np.exp(np.linspace(math.log(4.0), math.log(600.0), 502))
-"""Tried values of r_max, one per cent apart."""
+LIMIT_STEP, SOFTNESS_STEP = 0.01, 0.1
+"""Steps of the logarithm of r_max, and of the softness, between tried values."""
 
-SOFTNESSES: FloatArray = np.round(np.arange(0.2, 4.01, 0.1), 2)
+LIMITS_M: FloatArray = 4.0 * np.exp(LIMIT_STEP * np.arange(502))
+SOFTNESSES: FloatArray = np.round(np.arange(0.2, 4.01, SOFTNESS_STEP), 2)
 
 MIN_OBJECTS = 5
 """Fewest objects with a fit."""
@@ -43,6 +44,7 @@ MAX_SOFTNESS_ERROR = 0.25
 
 _BIN_M = 0.5
 _FEW = 1e-6
+_MOST_STEPS = 50.0
 
 
 @dataclass(frozen=True)
@@ -110,16 +112,19 @@ def fit_returns(
         expected = (1.0 - model.dropout) * _expected_points(range_m[beams], weight[beams])
         deviance[group[vehicle]] += _deviance(count, expected)
 
-    limit, softness = _minimum(deviance.sum(axis=0))
-    left_out = np.array([_minimum(deviance.sum(axis=0) - one) for one in deviance])
-    softness_se = math.sqrt(float(jackknife_variance(left_out[:, 1])))
-    at_edge = softness in (SOFTNESSES[0], SOFTNESSES[-1])
-    if len(numbers) < MIN_OBJECTS_SOFTNESS or at_edge or softness_se > MAX_SOFTNESS_ERROR * softness:
-        fixed = int(np.argmin(np.abs(SOFTNESSES - model.softness)))
-        row = deviance[:, fixed : fixed + 1]
-        limit, softness, softness_se = _minimum(row.sum(axis=0))[0], float(SOFTNESSES[fixed]), 0.0
-        left_out = np.array([_minimum(row.sum(axis=0) - one) for one in row])
-    limit_se = math.sqrt(float(jackknife_variance(np.log(left_out[:, 0]))))
+    total = deviance.sum(axis=0)
+    row, column = map(int, np.unravel_index(int(np.argmin(total)), total.shape))
+    is_inside = 0 < row < len(SOFTNESSES) - 1
+    estimates = _minima(total, deviance, row, column) if is_inside and len(numbers) >= MIN_OBJECTS_SOFTNESS else None
+    if estimates is not None:
+        (log_limit, softness), left_out = estimates
+        limit_se, softness_se = np.sqrt(jackknife_variance(left_out)).tolist()
+    if estimates is None or softness_se > MAX_SOFTNESS_ERROR * softness:
+        row = int(np.argmin(np.abs(SOFTNESSES - model.softness)))
+        log_limit, without = minima_of_limit(total[row], deviance[:, row])
+        limit_se = math.sqrt(float(jackknife_variance(without)))
+        softness, softness_se = float(SOFTNESSES[row]), 0.0
+    limit = math.exp(log_limit)
     rated_m = limit / model.limit_m(model.target_reflectivity()) * model.rated_range_m
     return ReturnFit(limit, limit_se, softness, softness_se, model.dropout, rated_m, len(measured), len(numbers))
 
@@ -142,8 +147,49 @@ def _deviance(count: int, expected: FloatArray) -> FloatArray:
     return deviance
 
 
-def _minimum(deviance: FloatArray) -> tuple[float, float]:
-    """Return the limit and the softness with the smallest deviance, (softnesses, limits)."""
-    row, column = np.unravel_index(int(np.argmin(deviance)), deviance.shape)
-    softness = SOFTNESSES[row] if len(deviance) > 1 else math.nan
-    return float(LIMITS_M[column]), float(softness)
+def _minima(
+    total: FloatArray, parts: FloatArray, row: int, column: int
+) -> tuple[tuple[float, float], FloatArray] | None:
+    """Return where the deviance is smallest, and where it is without each part, by Newton's step from a grid point.
+
+    Each is the logarithm of the limit, and the softness; of the parts (k, 2). None where the deviance has no minimum.
+    """
+    column = min(max(column, 1), len(LIMITS_M) - 2)
+    start = np.array([math.log(LIMITS_M[column]), SOFTNESSES[row]])
+    found = []
+    for surface in (total, *(total - part for part in parts)):
+        near = surface[row - 1 : row + 2, column - 1 : column + 2]
+        gradient = np.array([near[1, 2] - near[1, 0], near[2, 1] - near[0, 1]]) / 2.0
+        mixed = (near[2, 2] - near[2, 0] - near[0, 2] + near[0, 0]) / 4.0
+        curvature = np.array(
+            [
+                [near[1, 2] - 2.0 * near[1, 1] + near[1, 0], mixed],
+                [mixed, near[2, 1] - 2.0 * near[1, 1] + near[0, 1]],
+            ]
+        )
+        if np.linalg.eigvalsh(curvature)[0] <= 0.0:
+            return None
+        found.append(start - np.linalg.solve(curvature, gradient) * (LIMIT_STEP, SOFTNESS_STEP))
+    (log_limit, softness), *left_out = found
+    return (float(log_limit), float(softness)), np.array(left_out)
+
+
+def minima_of_limit(total: FloatArray, parts: FloatArray) -> tuple[float, FloatArray]:
+    """Return the logarithm of the limit with the smallest deviance, and those without each part, (k,) float64.
+
+    By Newton's step from the best of :data:`LIMITS_M`.
+
+    Parameters
+    ----------
+    total
+        Deviance for each limit, (limits,).
+    parts
+        Deviance of each part, (k, limits).
+    """
+    column = min(max(int(np.argmin(total)), 1), len(LIMITS_M) - 2)
+    surfaces = np.vstack([total, total - parts])
+    below, at, above = surfaces[:, column - 1], surfaces[:, column], surfaces[:, column + 1]
+    curvature = np.maximum(above - 2.0 * at + below, _FEW)
+    steps = np.clip(-(above - below) / (2.0 * curvature), -_MOST_STEPS, _MOST_STEPS)
+    logarithms = math.log(LIMITS_M[column]) + steps * LIMIT_STEP
+    return float(logarithms[0]), logarithms[1:]

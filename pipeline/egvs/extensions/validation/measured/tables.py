@@ -154,7 +154,7 @@ def fitted_table(comparison: Comparison) -> str:
     keys = sensor_keys(sensor) | {
         "rated_range_m": round(fit.rated_range_m, 1),
         "rated_reflectivity": model.rated_reflectivity,
-        "softness": fit.softness,
+        "softness": round(fit.softness, 2),
         "dropout": fit.dropout,
     }
     lines = [
