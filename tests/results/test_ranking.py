@@ -123,12 +123,19 @@ def test_a_pole_from_which_people_notice_clearly_more_is_named() -> None:
     assert ranking_text.noticed_preference(by_vehicles(("a", 1.0, 0.9), ("b", 1.0, 0.8))) == ""
 
 
-def test_without_losses_the_share_noticed_is_an_upper_limit() -> None:
-    ranked = with_noticed(("a", 0.9, 0.80))
-    lossless = load(SCENARIOS / "demo", ["effects.range_limit=false"])
-    assert ranking_text.lossless_note(ranked, lossless).endswith("read that share as an upper limit.")
-    assert ranking_text.lossless_note(ranked, load(SCENARIOS / "demo")) == ""
-    assert ranking_text.lossless_note(by_vehicles(("a", 1.0, 0.9)), lossless) == ""
+def test_what_people_notice_is_an_upper_limit_for_sensors_without_losses(tmp_path: Path) -> None:
+    """One rule: losses that are off, and sensors without a rated range."""
+    demo, off = load(SCENARIOS / "demo"), load(SCENARIOS / "demo", ["effects.range_limit=false"])
+    assert sensor_text.upper_limit_note(off, ["VLP-32C", "VLP-32C"]) == (
+        "Losses of returns are not simulated for VLP-32C (effects.range_limit = false), but the curves of what people "
+        "notice are for points with losses: read that share as an upper limit."
+    )
+    assert sensor_text.upper_limit_note(demo, ["VLP-32C"]) == ""
+    unrated = load(SCENARIOS / "demo", ["sensors.mine={elevations_deg=[-10.0, 0.0], azimuth_step_deg=0.4, range_m=100.0}"])
+    assert "not simulated for mine (it has no rated range), but" in sensor_text.upper_limit_note(
+        unrated, ["VLP-32C", "mine"]
+    )
+    assert sensor_text.upper_limit_note(unrated, ["VLP-32C"]) == ""
 
 
 def test_a_sensor_with_which_people_notice_clearly_more_is_named() -> None:

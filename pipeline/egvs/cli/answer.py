@@ -26,7 +26,7 @@ from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import by_number, number_of
 from egvs.report import ranking_text, reliability, sections
 from egvs.report.extension_sections import read_sections
-from egvs.report.sensor_text import has_losses, range_note
+from egvs.report.sensor_text import has_losses, range_note, upper_limit_note
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
 from egvs.results.ranking import Pole, RankedSite, Ranking
 from egvs.scenario.model import Scenario
@@ -70,9 +70,9 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     if caveats := sections.describe_caveats(scenario, "ranking", on_road, plans):
         sentences.append(caveats)
     sentences += reliability.describe_reliability(ranked, traffic_summary, scenario.score.ranking_detectors)
-    if note := ranking_text.lossless_note(ranked, scenario):
-        sentences.append(note)
     sensors = [site.sensor for site in ranked.sites]
+    if ranked.has_noticed and (note := upper_limit_note(scenario, sensors)):
+        sentences.append(note)
     if note := range_note(sensors, is_modelled=has_losses(scenario, sensors)):
         sentences.append(note)
     print_sentences(sentences)

@@ -39,7 +39,6 @@ from egvs.report.ranking_text import (
     entropy_seen_note,
     headline,
     lead,
-    lossless_note,
     noticed_preference,
     recorded_frames_hint,
 )
@@ -488,8 +487,10 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
     reliability = describe_reliability(
         contents.ranking, traffic_summary(contents.stages), contents.scenario.score.ranking_detectors
     )
-    if note := lossless_note(contents.ranking, contents.scenario):
-        reliability.append(note)
+    if contents.ranking.has_noticed:
+        sensors = [site.sensor for site in contents.ranking.sites]
+        if note := sensor_text.upper_limit_note(contents.scenario, sensors):
+            reliability.append(note)
     return {
         "warnings": warnings,
         "reliability": reliability,

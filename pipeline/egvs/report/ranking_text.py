@@ -62,16 +62,6 @@ def noticed_preference(ranking: Ranking) -> str:
     )
 
 
-def lossless_note(ranking: Ranking, scenario: Scenario) -> str:
-    """Return a sentence if what people would notice is an upper limit, as losses of returns are off; else empty."""
-    if ranking.sites[0].noticed is None or scenario.effects.range_limit is not False:
-        return ""
-    return (
-        "Losses of returns are off (effects.range_limit = false), but the curves of what people notice are for points "
-        "with losses: read that share as an upper limit."
-    )
-
-
 def headline(ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = ()) -> str:
     """Return the result in one sentence; ``detectors`` as for :func:`level`."""
     best, count = ranking.best, len(ranking.sites)
