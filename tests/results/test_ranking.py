@@ -131,7 +131,9 @@ def test_what_people_notice_is_an_upper_limit_for_sensors_without_losses(tmp_pat
         "notice are for points with losses: read that share as an upper limit."
     )
     assert sensor_text.upper_limit_note(demo, ["VLP-32C"]) == ""
-    unrated = load(SCENARIOS / "demo", ["sensors.mine={elevations_deg=[-10.0, 0.0], azimuth_step_deg=0.4, range_m=100.0}"])
+    unrated = load(
+        SCENARIOS / "demo", ["sensors.mine={elevations_deg=[-10.0, 0.0], azimuth_step_deg=0.4, range_m=100.0}"]
+    )
     assert "not simulated for mine (it has no rated range), but" in sensor_text.upper_limit_note(
         unrated, ["VLP-32C", "mine"]
     )

@@ -156,7 +156,7 @@ def _location(site: RankedSite) -> str:
 
 def order_by_egvs(ranked: Ranking, metadata: Mapping[str, Any]) -> str:
     """Return how the order by EGVS differs, in one sentence; empty where the EGVS ranks or has the same best site."""
-    by_egvs = sections.best_sites(ranked.sites, "egvs")
+    by_egvs = ranking_text.best_sites(ranked.sites, "egvs")
     if ranked.by.name == "egvs" or not by_egvs or by_egvs[0] == ranked.sites[0].site:
         return ""
     names = join_names(by_egvs)

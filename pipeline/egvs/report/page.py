@@ -36,10 +36,12 @@ from egvs.report.extension_sections import (
 )
 from egvs.report.points_section import MAPPED_POLES, PointsSection
 from egvs.report.ranking_text import (
+    egvs_setting,
     entropy_seen_note,
     headline,
     lead,
     noticed_preference,
+    ranking_disagreement,
     recorded_frames_hint,
 )
 from egvs.report.reliability import describe_reliability
@@ -50,8 +52,6 @@ from egvs.report.sections import (
     busiest_counts,
     describe_counts,
     describe_poles_on_road,
-    egvs_setting,
-    ranking_disagreement,
     study_values,
 )
 from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, has_losses, range_note
