@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.wording import by_number, format_percent, list_first
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability, join_names
-from egvs.results.levels import MIN_NOTICED_LEAD
+from egvs.results.levels import MIN_NOTICED_LEAD, FoundRange
 from egvs.results.ranking import CLOSE_SHARE, RankedSite, Ranking
 from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
@@ -40,7 +40,7 @@ FROM_SENSOR_NOTE = (
 )
 
 
-def level(site: RankedSite, detectors: Sequence[str]) -> str:
+def level(site: RankedSite, detectors: Sequence[str], found: FoundRange | None = None) -> str:
     """Return what a site achieves: what detectors should find and, beside it, what people would notice.
 
     Parameters
@@ -49,6 +49,8 @@ def level(site: RankedSite, detectors: Sequence[str]) -> str:
         The site.
     detectors
         Detectors that the score that ranks averages over; empty for a score without detectors.
+    found
+        The range that is stated instead of what detectors should find, where a number would not be supported.
 
     Returns
     -------
@@ -59,6 +61,9 @@ def level(site: RankedSite, detectors: Sequence[str]) -> str:
     text = site.by.sentence(site.score)
     if not detectors:
         return text
+    if found is not None:
+        untrained = format_percent(found.untrained, 0)
+        text = f"{site.by.says.format(found.text)} (models know nothing of the {untrained} that are not cars)"
     if len(detectors) > 1:
         text = f"detectors ({', '.join(detectors)}) {text}"
     else:
@@ -83,8 +88,10 @@ def noticed_preference(ranking: Ranking) -> str:
     )
 
 
-def headline(ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = ()) -> str:
-    """Return the result in one sentence; ``detectors`` as for :func:`level`."""
+def headline(
+    ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = (), found: FoundRange | None = None
+) -> str:
+    """Return the result in one sentence; ``detectors`` and ``found`` as for :func:`level`."""
     best, count = ranking.best, len(ranking.sites)
     top = best[0]
     if not has_traffic:
@@ -93,7 +100,7 @@ def headline(ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = ())
         return "No site sees any of the traffic" if count > 1 else f"{top.site} sees none of the traffic"
 
     by_egvs = top.rank_by == "egvs"
-    result = level(top, detectors)
+    result = level(top, detectors, found)
     if by_egvs:
         result = f"sees {format_percent(top.entropy_seen)} of the traffic’s uncertainty"
     of_first = f"; from {top.site}, {result}" if detectors else f": {top.site} {result}"
