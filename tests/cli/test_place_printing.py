@@ -108,6 +108,10 @@ def test_values_in_fused_clouds_follow_the_assumption(capsys: pytest.CaptureFixt
     noticed = FusedPlan(steps, noticed=NoticedShare(0.985, 0.011, 0.985, 0.985))
     text = printed(placed_two(fused=noticed), capsys)
     assert text.endswith(f"{first}. People would notice 98 ± 1 % of vehicles there.\n")
+    alone = FusedPlan(steps[:1], noticed=NoticedShare(0.985, 0.011, 0.985, 0.985))
+    text = printed(placed_two(fused=alone), capsys)
+    assert text.endswith(f"{LAST_LINES}People would notice 98 ± 1 % of vehicles in the sweeps of this sensor.\n")
+    assert printed(placed_two(fused=FusedPlan(steps[:1])), capsys).endswith(LAST_LINES)
 
 
 def test_bits_have_thousands_separators(capsys: pytest.CaptureFixture[str]) -> None:
@@ -148,7 +152,7 @@ def test_costs_are_printed_only_where_they_are_set(capsys: pytest.CaptureFixture
 
 def test_ends_with_what_was_assumed(capsys: pytest.CaptureFixture[str]) -> None:
     caveat = "Before you trust this plan: assumed, not measured: positions of the poles."
-    place.print_placement(placed_two(), caveat=caveat)
+    place.print_placement(placed_two(), caveats=[caveat])
     assert capsys.readouterr().out.splitlines()[-1] == caveat
 
 

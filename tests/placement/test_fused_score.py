@@ -17,6 +17,7 @@ from egvs.placement.fused_score import FusedScore, improve_by_fused_swaps
 from egvs.placement.problem import Plan, PlanRules, Problem
 from egvs.runs.run_context import open_folder
 from egvs.scoring.fused_targets import fuse_targets
+from egvs.scoring.noticed import noticed_chances
 from egvs.scoring.target_scores import expected_detections
 from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
@@ -164,10 +165,19 @@ def test_no_pair_of_candidates_finds_more(placed: SimpleNamespace) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("settings", [[FOUND, "placement.count=1"], ["score.rank_by='points_on_target'"]])
-def test_other_plans_have_no_values_in_fused_clouds(placed: SimpleNamespace, settings: list[str]) -> None:
-    scenario = egvs.load(placed.folder, ["placement.count=2", "tpog.blocks=10", *settings])
-    assert egvs.place(scenario, placed.out).fused is None
+def test_plans_by_points_have_no_values_in_fused_clouds(placed: SimpleNamespace) -> None:
+    settings = ["score.rank_by='points_on_target'", "placement.count=2", "tpog.blocks=10"]
+    assert egvs.place(egvs.load(placed.folder, settings), placed.out).fused is None
+
+
+@pytest.mark.slow
+def test_what_people_notice_of_a_plan_of_one_sensor_is_that_of_its_scan(placed: SimpleNamespace) -> None:
+    settings = [FOUND, "placement.count=1", "tpog.blocks=10"]
+    plan = egvs.place(egvs.load(placed.folder, settings), placed.out)
+    (sensor,) = plan.sensors
+    assert not plan.fused.searched and plan.fused.better is None
+    assert plan.fused.noticed.value == pytest.approx(noticed_chances(placed.views[sensor.site]).mean(), rel=1e-12)
+    assert plan.fused.noticed.se > 0.0
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from egvs.drawing.run_figures import site_caption
 from egvs.report import ranking_text, sensor_text
 from egvs.report.sections import describe_poles_on_road
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.levels import NoticedShare
+from egvs.results.levels import GroupLevel, NoticedShare, found_range
 from egvs.results.ranking import Pole, RankedSite, Ranking, ScoreValue
 from egvs.results.sensors import SensorComparison
 from egvs.scenario.loading import load
@@ -112,6 +112,26 @@ def test_a_level_that_nothing_supports_is_a_range() -> None:
     assert NoticedShare(0.5, None, 0.5, 0.5).text == "50 %"
 
 
+def test_what_detectors_find_is_a_range_where_many_vehicles_are_not_cars() -> None:
+    """0.75 x 0.9 of all are cars that are found; of the other 25 %, none or all. The order of sites stays."""
+    noticed = NoticedShare(0.9, 0.02, 0.9, 0.9)
+    cars = GroupLevel("cars", 300, 0.75, 0.9, 0.01, noticed)
+    larger, people = (
+        GroupLevel("larger vehicles", 80, 0.2, 0.4, 0.02, noticed),
+        GroupLevel("people", 20, 0.05, 0.5, 0.02, noticed),
+    )
+    found = found_range([cars, larger, people])
+    assert (found.low, found.high, found.untrained) == pytest.approx((0.675, 0.925, 0.25))
+    ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
+    assert ranking_text.headline(ranked, has_traffic=True, detectors=BOTH, found=found) == (
+        "a is the best of 2 sites: detectors (cluster, pointpillars) should find 65 to 95 % of vehicles (models know "
+        "nothing of the 25 % that are not cars); people would notice 90 ± 2 % in its sweeps"
+    )
+    assert found_range([replace(larger, weight_share=1.0)]).text == "0 to 100 %"
+    few = [replace(cars, weight_share=0.9), replace(larger, weight_share=0.1)]
+    assert found_range(few) is None and found_range(()) is None
+
+
 def test_a_pole_from_which_people_notice_clearly_more_is_named() -> None:
     ranked = with_noticed(("a", 0.9, 0.80), ("b", 0.8, 0.809), ("c", 0.7, 0.85), ("d", 0.6, 0.5))
     assert ranking_text.noticed_preference(ranked) == (
@@ -123,12 +143,21 @@ def test_a_pole_from_which_people_notice_clearly_more_is_named() -> None:
     assert ranking_text.noticed_preference(by_vehicles(("a", 1.0, 0.9), ("b", 1.0, 0.8))) == ""
 
 
-def test_without_losses_the_share_noticed_is_an_upper_limit() -> None:
-    ranked = with_noticed(("a", 0.9, 0.80))
-    lossless = load(SCENARIOS / "demo", ["effects.range_limit=false"])
-    assert ranking_text.lossless_note(ranked, lossless).endswith("read that share as an upper limit.")
-    assert ranking_text.lossless_note(ranked, load(SCENARIOS / "demo")) == ""
-    assert ranking_text.lossless_note(by_vehicles(("a", 1.0, 0.9)), lossless) == ""
+def test_what_people_notice_is_an_upper_limit_for_sensors_without_losses(tmp_path: Path) -> None:
+    """One rule: losses that are off, and sensors without a rated range."""
+    demo, off = load(SCENARIOS / "demo"), load(SCENARIOS / "demo", ["effects.range_limit=false"])
+    assert sensor_text.upper_limit_note(off, ["VLP-32C", "VLP-32C"]) == (
+        "Losses of returns are not simulated for VLP-32C (effects.range_limit = false), but the curves of what people "
+        "notice are for points with losses: read that share as an upper limit."
+    )
+    assert sensor_text.upper_limit_note(demo, ["VLP-32C"]) == ""
+    unrated = load(
+        SCENARIOS / "demo", ["sensors.mine={elevations_deg=[-10.0, 0.0], azimuth_step_deg=0.4, range_m=100.0}"]
+    )
+    assert "not simulated for mine (it has no rated range), but" in sensor_text.upper_limit_note(
+        unrated, ["VLP-32C", "mine"]
+    )
+    assert sensor_text.upper_limit_note(unrated, ["VLP-32C"]) == ""
 
 
 def test_a_sensor_with_which_people_notice_clearly_more_is_named() -> None:

@@ -229,6 +229,8 @@ def test_groups_have_a_level_each(mini: Path, tmp_path: Path, run_egvs) -> None:
         assert [group["road_users"] for group in groups] == ["cars", "larger vehicles"]
         counts = [group["observations"] for group in groups]
         assert sum(counts) == of_all["observations"]
+        shares = [group["weight_share"] for group in groups]
+        assert shares == pytest.approx([n / sum(counts) for n in counts]) and of_all["weight_share"] == 1.0
         for name in ("expected_detections", "noticed"):
             mean = sum(n * group[name] for n, group in zip(counts, groups, strict=True)) / sum(counts)
             assert of_all[name] == pytest.approx(mean, rel=1e-9)
@@ -241,6 +243,8 @@ def test_groups_have_a_level_each(mini: Path, tmp_path: Path, run_egvs) -> None:
     assert line.split()[2] == str(larger["observations"]) and line.endswith(f"{noticed_percent} ± {error} %")
     assert "they say nothing about vans, trucks and buses" in " ".join(printed.split())
     page = (tmp_path / "report.html").read_text(encoding="utf-8").replace("\u00a0", " ")
+    unknown = f"(models know nothing of the {100.0 * larger['weight_share']:.0f} % that are not cars); people would"
+    assert unknown in " ".join(printed.split()) and unknown in page
     assert "TUM Traffic Intersection Dataset, Zimmer et al. 2023" in page
     assert f'<th scope="row">larger vehicles</th><td class="n">{larger["observations"]}</td>' in page
     assert f"{noticed_percent} ± {error} %</td>" in page

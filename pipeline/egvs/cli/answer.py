@@ -26,8 +26,9 @@ from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import by_number, number_of
 from egvs.report import ranking_text, reliability, sections
 from egvs.report.extension_sections import read_sections
-from egvs.report.sensor_text import has_losses, range_note
+from egvs.report.sensor_text import has_losses, range_note, upper_limit_note
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
+from egvs.results.levels import FoundRange, found_range, read_levels
 from egvs.results.ranking import Pole, RankedSite, Ranking
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import NOTICED
@@ -70,9 +71,9 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     if caveats := sections.describe_caveats(scenario, "ranking", on_road, plans):
         sentences.append(caveats)
     sentences += reliability.describe_reliability(ranked, traffic_summary, scenario.score.ranking_detectors)
-    if note := ranking_text.lossless_note(ranked, scenario):
-        sentences.append(note)
     sensors = [site.sensor for site in ranked.sites]
+    if ranked.has_noticed and (note := upper_limit_note(scenario, sensors)):
+        sentences.append(note)
     if note := range_note(sensors, is_modelled=has_losses(scenario, sensors)):
         sentences.append(note)
     print_sentences(sentences)
@@ -110,7 +111,8 @@ def _print_ranking(
 ) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
     hint = ranking_text.recorded_frames_hint(scenario, ranked, record.stages)
-    print_sentences([verdict(ranked, hint, scenario.score.ranking_detectors)])
+    found = found_range(read_levels(RunFolder(folder).levels, ranked.sites[0].site))
+    print_sentences([verdict(ranked, hint, scenario.score.ranking_detectors, found)])
     for part in read_sections(RunFolder(folder), scenario, record.stages):
         for warning in part.warnings:
             print_sentences([f"{warning.sentence} See {RunFolder(folder).report}#{part.section.name}"])
@@ -136,12 +138,12 @@ def _print_ranking(
         print_sentences([preference])
 
 
-def verdict(ranked: Ranking, hint: str = "", detectors: Sequence[str] = ()) -> str:
+def verdict(ranked: Ranking, hint: str = "", detectors: Sequence[str] = (), found: FoundRange | None = None) -> str:
     """Return a few sentences: the best site, how clearly it leads and, if unclear, the ``hint`` on what helps.
 
-    ``detectors`` are those of the score that ranks.
+    ``detectors`` are those of the score that ranks; ``found`` as for :func:`egvs.report.ranking_text.level`.
     """
-    sentences = [f"{ranking_text.headline(ranked, has_traffic=True, detectors=detectors)}."]
+    sentences = [f"{ranking_text.headline(ranked, has_traffic=True, detectors=detectors, found=found)}."]
     if lead := ranking_text.lead(ranked, hint):
         sentences.append(lead)
     return " ".join(sentences)
@@ -156,7 +158,7 @@ def _location(site: RankedSite) -> str:
 
 def order_by_egvs(ranked: Ranking, metadata: Mapping[str, Any]) -> str:
     """Return how the order by EGVS differs, in one sentence; empty where the EGVS ranks or has the same best site."""
-    by_egvs = sections.best_sites(ranked.sites, "egvs")
+    by_egvs = ranking_text.best_sites(ranked.sites, "egvs")
     if ranked.by.name == "egvs" or not by_egvs or by_egvs[0] == ranked.sites[0].site:
         return ""
     names = join_names(by_egvs)

@@ -70,7 +70,7 @@ def place(
         from egvs.artefacts.run_record import RunRecord
         from egvs.cli import answer
         from egvs.placement import plan
-        from egvs.report import sections
+        from egvs.report import sections, sensor_text
 
         screen.flow_source = answer.flow_source(loaded)
         replaced = plan.planned_request(folder)
@@ -84,7 +84,10 @@ def place(
     if exact and not (placed.is_best or placed.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
     plans = RunRecord.read(folder).traffic_summary.get("signals", ())
-    print_placement(placed, notes, sections.describe_caveats(loaded, "plan", plans=plans))
+    caveats = [sections.describe_caveats(loaded, "plan", plans=plans)]
+    if placed.fused is not None and placed.fused.noticed is not None:
+        caveats.append(sensor_text.upper_limit_note(loaded, [sensor.sensor for sensor in placed.sensors]))
+    print_placement(placed, notes, [caveat for caveat in caveats if caveat])
 
 
 def _check_request(count: int | None, budget: float | None, reach: float | None) -> None:
@@ -100,7 +103,7 @@ def _check_request(count: int | None, budget: float | None, reach: float | None)
         raise InputError("--reach", f"expected a share above 0, at most 1, got {reach:g}", hint)
 
 
-def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveat: str = "") -> None:
+def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveats: Sequence[str] = ()) -> None:
     """Print the plan and the curve, what a planner should know, and the files.
 
     Parameters
@@ -109,8 +112,8 @@ def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveat: str =
         The plan.
     notes
         Sentences about the search.
-    caveat
-        The last sentence, on what was assumed; may be empty.
+    caveats
+        The last sentences, on what was assumed.
     """
     from egvs.artefacts.readers import describe_worst_zones, worst_zones
     from egvs.cli.console import WIDE, console, print_sentences
@@ -131,10 +134,7 @@ def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveat: str =
         )
     if worst := worst_zones(placed.zone_results):
         print_sentences([describe_worst_zones("the plan", worst)])
-    sentences = [describe_plan(placed), *notes, *_further_sentences(placed)]
-    if caveat:
-        sentences.append(caveat)
-    print_sentences(sentences)
+    print_sentences([describe_plan(placed), *notes, *_further_sentences(placed), *caveats])
     for path in placed.files:
         out.print(str(path), soft_wrap=True)
 
@@ -151,12 +151,14 @@ def _further_sentences(placed: SensorPlan) -> Iterator[str]:
         yield answer
     if assumption := plan_answer.describe_joint_score(placed.by, len(placed.sensors)):
         yield assumption
-    if placed.fused is not None:
-        yield describe_fused(placed.fused, placed.by)
+    if placed.fused is not None and (fused := describe_fused(placed.fused, placed.by)):
+        yield fused
 
 
 def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
     """Return what the sensors of a plan find in their fused point clouds, and whether other sites find more there.
+
+    Of one sensor, whose cloud is not fused, it is what people would notice only; empty if that is unknown.
 
     Parameters
     ----------
@@ -165,6 +167,9 @@ def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
     by
         Label of the joint score.
     """
+    noticed = f"People would notice {fused.noticed.text} of vehicles" if fused.noticed is not None else ""
+    if len(fused.steps) == 1:
+        return f"{noticed} in the sweeps of this sensor." if noticed else ""
     first, *further = (by.with_error(step.score, step.score_se) for step in fused.steps)
     values = [f"{first} with the first sensor"]
     values += [f"{value} with {step.count}" for step, value in zip(fused.steps[1:], further, strict=True)]
@@ -173,7 +178,8 @@ def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
         f"Found where all point clouds are fused before detection: {', '.join(values)} (the last one adds {last} "
         f"{by.change_unit})"
     )
-    noticed = f" People would notice {fused.noticed.text} of vehicles there." if fused.noticed is not None else ""
+    if noticed:
+        noticed = f" {noticed} there."
     if fused.better is not None:
         gain = by.change(fused.better.gain, fused.better.gain_se)
         return f"{text}; {', '.join(fused.better_sites)} should find {gain} {by.change_unit} more there.{noticed}"

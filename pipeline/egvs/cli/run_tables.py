@@ -27,7 +27,7 @@ from egvs.cli.console import (
 )
 from egvs.core.errors import collect_warnings
 from egvs.core.wording import format_percent
-from egvs.report import sections
+from egvs.report import ranking_text
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability
 from egvs.results.levels import GROUPS_NOTE, GroupLevel, read_levels
 from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pole
@@ -135,13 +135,13 @@ def _outcome_sentences(folder: Path, record: RunRecord, sites: Sequence[RankedSi
             sentence += " (weighted by class)"
         sentences.append(sentence)
 
-    egvs_setting = sections.egvs_setting(
+    egvs_setting = ranking_text.egvs_setting(
         float(metadata["gamma"]),
         metadata["grid"]["voxel_m"],
         moving_occlusion="moving_occlusion" in record.scenario.get("effects", {}),
     )
     detectors = [record.scenario.get("score", {}).get("detector", ALL_DETECTORS)]
-    if disagreement := sections.ranking_disagreement(sites, egvs_setting, detectors=detectors):
+    if disagreement := ranking_text.ranking_disagreement(sites, egvs_setting, detectors=detectors):
         sentences.append(disagreement)
     return sentences
 

@@ -34,8 +34,39 @@ _VIRIDIS = (
 SHADES = {"day": (128, 128, 136, 84), "night": (218, 126, 82, 166)}
 """RGBA of the shade over columns that no beam crosses; on dark pages brown, unlike buildings, roads and the scale."""
 
+Colour = tuple[int, int, int]
+"""Red, green, blue, 0 to 255."""
+
+_LIGHT_SOLIDS: Mapping[str, Colour] = {
+    "building": (205, 208, 216), "ground": (225, 222, 214), "tree_crown": (150, 190, 165), "lanes": (112, 118, 130),
+    "junctions": (112, 118, 130), "markings": (250, 250, 250), "other": (150, 154, 166),
+}  # fmt: skip
+_DARK_SOLIDS: Mapping[str, Colour] = {
+    "building": (66, 70, 82), "ground": (34, 36, 42), "tree_crown": (52, 88, 66), "lanes": (52, 56, 66),
+    "junctions": (52, 56, 66), "markings": (150, 154, 164), "other": (92, 96, 108),
+}  # fmt: skip
+
 _FADE = 0.22
 """Below this share of the scale, colours fade into the page."""
+
+
+def solid_colour(kind: str, *, is_dark: bool = False) -> Colour:
+    """Return the colour of a mesh of the static world or the road in three dimensions.
+
+    Parameters
+    ----------
+    kind
+        Kind of solid, e.g. ``"building"``, or ``"lanes"``; others have one common colour.
+    is_dark
+        Whether the page is dark.
+
+    Examples
+    --------
+    >>> solid_colour("ground"), solid_colour("fence") == solid_colour("other")
+    ((225, 222, 214), True)
+    """
+    solids = _DARK_SOLIDS if is_dark else _LIGHT_SOLIDS
+    return solids.get(kind, solids["other"])
 
 
 def interpolate_colour(step: int, steps: int, stops: Sequence[str]) -> bytes:

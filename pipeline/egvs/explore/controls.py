@@ -19,7 +19,7 @@ from egvs.explore.session import MovingPlan, PoseScore, Session
 from egvs.explore.settings import Settings
 from egvs.explore.view_state import LAYERS, View
 from egvs.results.labels import SCORE_LABELS
-from egvs.scenario.score_config import NOTICED, RankingScore
+from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED, RankingScore
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site
 
@@ -59,7 +59,7 @@ HELP = (
 
 
 def describe_score(rating: PoseScore, rank_by: str, candidate: PoseScore, candidates: int) -> str:
-    """Describe the scores of a sensor, or why it cannot be mounted there.
+    """Describe the scores of a sensor, or why it cannot be mounted there; what people notice beside what is found.
 
     Parameters
     ----------
@@ -85,6 +85,9 @@ def describe_score(rating: PoseScore, rank_by: str, candidate: PoseScore, candid
     before = candidate.scores[rank_by]
     if before > 0.0 and rating.site.pose != candidate.site.pose:
         title += f" ({format_percent(rating.scores[rank_by] / before - 1.0, signed=True)})"
+    if rank_by == DEFAULT_SCORE and NOTICED in rating.scores:
+        noticed = SCORE_LABELS[NOTICED]
+        title += f", {noticed.value(rating.scores[NOTICED])} {noticed.head}"
     rows = [f"| {plain_name(name)} | {format_score(name, value)} |" for name, value in rating.scores.items()]
     rank = f"rank {rating.rank} of {candidates} by {plain_name(rank_by)}"
     return "\n".join([f"## {title}\n\n{rank}\n\n| score | value |\n|---|---|", *rows, "", findings_text])

@@ -27,6 +27,7 @@ from egvs.clouds.simulation import MeshPart
 from egvs.core.grid import Grid, Roi, Vec3
 from egvs.core.wording import format_percent, number_of
 from egvs.drawing import colours
+from egvs.drawing.colours import Colour
 from egvs.explore.road_meshes import LANE_HEIGHT_M, Mesh, junction_mesh, lane_mesh, marking_mesh
 from egvs.explore.session import MovingPlan, Playback, PoseScore, Session
 from egvs.explore.view_state import Camera, View
@@ -42,16 +43,6 @@ Bytes = NDArray[np.uint8]
 Quaternion = tuple[float, float, float, float]
 """w, x, y, z."""
 
-Colour = tuple[int, int, int]
-
-_LIGHT_COLOURS: dict[str, Colour] = {
-    "building": (205, 208, 216), "ground": (225, 222, 214), "tree_crown": (150, 190, 165), "lanes": (112, 118, 130),
-    "junctions": (112, 118, 130), "markings": (250, 250, 250), "other": (150, 154, 166),
-}  # fmt: skip
-DARK_COLOURS: dict[str, Colour] = {
-    "building": (66, 70, 82), "ground": (34, 36, 42), "tree_crown": (52, 88, 66), "lanes": (52, 56, 66),
-    "junctions": (52, 56, 66), "markings": (150, 154, 164), "other": (92, 96, 108),
-}  # fmt: skip
 _ROI_COLOUR = (232, 89, 12)
 _SITE_RADIUS_M, _PLAN_RADIUS_M = 0.9, 1.3
 _PLAN_COLOUR, _NEXT_SITE_COLOUR = (214, 40, 120), (120, 60, 200)
@@ -280,7 +271,7 @@ class SceneMeshes:
             if not len(mesh.faces):
                 continue
             handles[kind] = scene.add_mesh_simple(
-                f"/world/{kind}", mesh.points, mesh.faces, color=solid_colour(kind, _LIGHT_COLOURS),
+                f"/world/{kind}", mesh.points, mesh.faces, color=colours.solid_colour(kind),
                 flat_shading=kind not in _FLAT_KINDS, side="double", cast_shadow=False,
             )  # fmt: skip
         return cls(handles, drawn, len(session.scene.world.faces))
@@ -288,11 +279,7 @@ class SceneMeshes:
     def set_dark(self, is_dark: bool) -> None:
         """Use dark or light colours."""
         for kind, mesh in self.meshes.items():
-            mesh.color = solid_colour(kind, DARK_COLOURS if is_dark else _LIGHT_COLOURS)
-
-
-def solid_colour(kind: str, palette: dict[str, Colour]) -> Colour:
-    return palette.get(kind, palette["other"])
+            mesh.color = colours.solid_colour(kind, is_dark=is_dark)
 
 
 OnClick = Callable[[Site], None]

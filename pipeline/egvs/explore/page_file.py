@@ -24,6 +24,7 @@ from egvs.core.errors import InputError, RunError
 from egvs.core.grid import Vec3
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import format_percent
+from egvs.drawing.colours import solid_colour
 from egvs.explore import controls, drawing, map_symbols
 from egvs.explore.access import AccessGuard
 from egvs.explore.recorded_traffic import TrafficClip, TrafficRecorder
@@ -263,7 +264,7 @@ def _script_values(world: drawing.SceneMeshes, layers: list[_Layer]) -> str:
     """Return what the page's script needs as JSON: nodes of layers, and colours of meshes on a dark page."""
     values = {
         "layers": [layer.node for layer in layers if layer.node],
-        "dark": {f"/world/{kind}": drawing.solid_colour(kind, drawing.DARK_COLOURS) for kind in world.meshes},
+        "dark": {f"/world/{kind}": solid_colour(kind, is_dark=True) for kind in world.meshes},
     }
     return json.dumps(values, sort_keys=True).replace("<", "\\u003c")
 

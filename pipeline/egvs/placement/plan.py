@@ -347,7 +347,7 @@ def _fused_plan(
         The sites of ``problem`` if they were refined: what was moved is scanned anew, and there are no swaps.
     """
     view = placement_problem.views[-1]
-    if placement_problem.score != fused_score.FUSED_SCORE or len(order) < 2:
+    if placement_problem.score != fused_score.FUSED_SCORE or not order:
         return None
     assert isinstance(view, TargetView)
     sites = placement_problem.sites if refined_sites is None else refined_sites
@@ -359,7 +359,7 @@ def _fused_plan(
         yield from ((scan.site.name, scan.beams) for scan in empty_scans(context, unmoved))
 
     score = FusedScore(view.targets, [site.name for site in sites], read_scans)
-    search = refined_sites is None and not problem.survives and problem.objective == (problem.joint,)
+    search = len(order) > 1 and refined_sites is None and not problem.survives and problem.objective == (problem.joint,)
     return fused_score.evaluate_fused_plan(score, problem, order, errors, search=search)
 
 

@@ -36,11 +36,12 @@ from egvs.report.extension_sections import (
 )
 from egvs.report.points_section import MAPPED_POLES, PointsSection
 from egvs.report.ranking_text import (
+    egvs_setting,
     entropy_seen_note,
     headline,
     lead,
-    lossless_note,
     noticed_preference,
+    ranking_disagreement,
     recorded_frames_hint,
 )
 from egvs.report.reliability import describe_reliability
@@ -51,14 +52,12 @@ from egvs.report.sections import (
     busiest_counts,
     describe_counts,
     describe_poles_on_road,
-    egvs_setting,
-    ranking_disagreement,
     study_values,
 )
 from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, has_losses, range_note
 from egvs.results import labels as formatting
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.levels import GROUPS_NOTE, GroupLevel, read_levels
+from egvs.results.levels import GROUPS_NOTE, GroupLevel, found_range, read_levels
 from egvs.results.map_credits import read_map_credits
 from egvs.results.ranking import RankedSite, Ranking, share_of_limit
 from egvs.results.sensors import SensorComparison
@@ -488,8 +487,10 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
     reliability = describe_reliability(
         contents.ranking, traffic_summary(contents.stages), contents.scenario.score.ranking_detectors
     )
-    if note := lossless_note(contents.ranking, contents.scenario):
-        reliability.append(note)
+    if contents.ranking.has_noticed:
+        sensors = [site.sensor for site in contents.ranking.sites]
+        if note := sensor_text.upper_limit_note(contents.scenario, sensors):
+            reliability.append(note)
     return {
         "warnings": warnings,
         "reliability": reliability,
@@ -503,7 +504,9 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     has_occlusion = "moving_occlusion" in scenario.effects.named
     setting = egvs_setting(scenario.gamma, tpog.grid.voxel_m, moving_occlusion=has_occlusion)
     return {
-        "headline": headline(ranking, bool(tpog.counts.any()), scenario.score.ranking_detectors),
+        "headline": headline(
+            ranking, bool(tpog.counts.any()), scenario.score.ranking_detectors, found_range(contents.levels)
+        ),
         "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
         "preference": noticed_preference(ranking),

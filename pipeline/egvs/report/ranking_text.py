@@ -1,4 +1,8 @@
-"""Sentences about a ranking, for the report and the terminal: the best site, its lead, and what makes it clearer."""
+"""Sentences about a ranking, for the report and the terminal: the best site, its lead, and what makes it clearer.
+
+:func:`ranking_disagreement` compares the EGVS with the recommended score by the evidence of the validation study
+(:mod:`egvs.results.study_results`); a setting that was not measured is not in it.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,12 @@ from collections.abc import Mapping, Sequence
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.wording import by_number, format_percent, list_first
-from egvs.results.labels import ScoreLabel, format_probability, join_names
-from egvs.results.levels import MIN_NOTICED_LEAD
+from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability, join_names
+from egvs.results.levels import MIN_NOTICED_LEAD, FoundRange
 from egvs.results.ranking import CLOSE_SHARE, RankedSite, Ranking
+from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
-from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 
 MIN_RELEVANT_LEAD = 0.001
 """Poles whose scores differ by less are equally good; of shares as it is, of others relative to the best score."""
@@ -18,8 +23,24 @@ MIN_RELEVANT_LEAD = 0.001
 _MIN_LEAD = 0.0005
 """Shares that differ by less than this look the same with one decimal."""
 
+COMPARED_SITES = 3
+"""Number of best sites that :func:`ranking_disagreement` compares."""
 
-def level(site: RankedSite, detectors: Sequence[str]) -> str:
+RHO_RANGE = (
+    "{:.2f} to {:.2f}, depending on junction and detector; among sites of equal height, {:.2f} to {:.2f}".format(
+        *STUDY.larger_study.rho, *STUDY.larger_study.rho_at_equal_height
+    )
+)
+"""Rank correlation of the recommended score with detection, over the held-out junctions and the detectors of the larger
+study (docs/validity.md)."""
+
+FROM_SENSOR_NOTE = (
+    "This detector measures heights from the sensor, and the score for it was tested at "
+    f"{STUDY.heights_from_sensor.sites} sites of one junction only (docs/validity.md)."
+)
+
+
+def level(site: RankedSite, detectors: Sequence[str], found: FoundRange | None = None) -> str:
     """Return what a site achieves: what detectors should find and, beside it, what people would notice.
 
     Parameters
@@ -28,6 +49,8 @@ def level(site: RankedSite, detectors: Sequence[str]) -> str:
         The site.
     detectors
         Detectors that the score that ranks averages over; empty for a score without detectors.
+    found
+        The range that is stated instead of what detectors should find, where a number would not be supported.
 
     Returns
     -------
@@ -38,6 +61,9 @@ def level(site: RankedSite, detectors: Sequence[str]) -> str:
     text = site.by.sentence(site.score)
     if not detectors:
         return text
+    if found is not None:
+        untrained = format_percent(found.untrained, 0)
+        text = f"{site.by.says.format(found.text)} (models know nothing of the {untrained} that are not cars)"
     if len(detectors) > 1:
         text = f"detectors ({', '.join(detectors)}) {text}"
     else:
@@ -62,18 +88,10 @@ def noticed_preference(ranking: Ranking) -> str:
     )
 
 
-def lossless_note(ranking: Ranking, scenario: Scenario) -> str:
-    """Return a sentence if what people would notice is an upper limit, as losses of returns are off; else empty."""
-    if ranking.sites[0].noticed is None or scenario.effects.range_limit is not False:
-        return ""
-    return (
-        "Losses of returns are off (effects.range_limit = false), but the curves of what people notice are for points "
-        "with losses: read that share as an upper limit."
-    )
-
-
-def headline(ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = ()) -> str:
-    """Return the result in one sentence; ``detectors`` as for :func:`level`."""
+def headline(
+    ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = (), found: FoundRange | None = None
+) -> str:
+    """Return the result in one sentence; ``detectors`` and ``found`` as for :func:`level`."""
     best, count = ranking.best, len(ranking.sites)
     top = best[0]
     if not has_traffic:
@@ -82,7 +100,7 @@ def headline(ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = ())
         return "No site sees any of the traffic" if count > 1 else f"{top.site} sees none of the traffic"
 
     by_egvs = top.rank_by == "egvs"
-    result = level(top, detectors)
+    result = level(top, detectors, found)
     if by_egvs:
         result = f"sees {format_percent(top.entropy_seen)} of the traffic’s uncertainty"
     of_first = f"; from {top.site}, {result}" if detectors else f": {top.site} {result}"
@@ -234,3 +252,70 @@ def entropy_seen_note(ranking: Ranking) -> str:
         f"({format_percent(most.entropy_seen)} against {format_percent(top.entropy_seen)}), but with fewer beams. "
         "One beam is enough for a voxel to count as seen, but not to detect a vehicle."
     )
+
+
+# ---- evidence of the validation study
+
+
+def egvs_setting(gamma: float, voxel_m: float, *, moving_occlusion: bool = False) -> str:
+    """Return the key of an EGVS setting in :attr:`egvs.results.study_results.FirstStudy.rho`."""
+    occlusion = "moving occlusion, " if moving_occlusion else ""
+    return f"egvs (gamma {gamma:g}, {occlusion}voxel {voxel_m:g})"
+
+
+def ranking_disagreement(
+    sites: Sequence[RankedSite],
+    egvs: str,
+    rho: Mapping[str, Mapping[str, float]] = STUDY.first_study.rho,
+    detectors: Sequence[str] = (),
+) -> str:
+    """Return sentences if the EGVS and the recommended score have different best sites; empty otherwise.
+
+    Parameters
+    ----------
+    sites
+        Sites with both scores; the result is empty if one is missing.
+    egvs
+        The EGVS setting of the run, from :func:`egvs_setting`.
+    rho
+        The evidence, by score and detector; that of the first study by default.
+    detectors
+        Detectors that the recommended score stands for.
+    """
+    by_egvs, by_other = best_sites(sites, "egvs"), best_sites(sites, DEFAULT_SCORE)
+    if not by_egvs or not by_other or (by_egvs[0] == by_other[0] and set(by_egvs) == set(by_other)):
+        return ""
+    noun = SCORE_LABELS[DEFAULT_SCORE].noun
+    evidence = FROM_SENSOR_NOTE if FROM_SENSOR in detectors else _describe_evidence(noun, egvs, rho)
+    return f"The best sites by EGVS are {join_names(by_egvs)}; by {noun} they are {join_names(by_other)}. {evidence}"
+
+
+def best_sites(sites: Sequence[RankedSite], name: str) -> tuple[str, ...]:
+    """Return the best sites by one score, equal ones in the order of the sites; empty if a value is missing."""
+    values = [site.value_of(name) for site in sites]
+    if any(value is None for value in values):
+        return ()
+    ranked = sorted(zip(sites, values, strict=True), key=lambda pair: -float(pair[1] or 0.0))
+    return tuple(site.site for site, _ in ranked[:COMPARED_SITES])
+
+
+def _describe_evidence(noun: str, egvs: str, rho: Mapping[str, Mapping[str, float]]) -> str:
+    """Sentences on how well both scores predicted detection in the study."""
+    recommended, this_egvs = rho.get(DEFAULT_SCORE, {}), rho.get(egvs, {})
+    detectors = [detector for detector in recommended if detector in this_egvs]
+    if not detectors:
+        text = "How well this setting of the EGVS predicts detection was not measured."
+        if recommended:
+            text += f" The rank correlation of {noun} with detection is {RHO_RANGE}; see docs/validity.md."
+        return text
+
+    is_better = [recommended[detector] > this_egvs[detector] for detector in detectors]
+    if all(is_better):
+        verdict = f"{noun} was the better predictor of detection"
+    elif any(is_better):
+        verdict = "neither score was consistently the better predictor of detection"
+    else:
+        verdict = "the EGVS was the better predictor of detection"
+    values = join_names([f"{recommended[name]:.2f} against {this_egvs[name]:.2f} ({name})" for name in detectors])
+    where = "At the held-out junctions of the validation study"
+    return f"{where}, {verdict}: mean rank correlation {values}. That of {noun} is {RHO_RANGE}; see docs/validity.md."

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from egvs.core.wording import format_percent
-from egvs.report.sections import FROM_SENSOR_NOTE
+from egvs.report.ranking_text import FROM_SENSOR_NOTE
 from egvs.results.labels import join_names
 from egvs.results.ranking import RankedSite, Ranking
 from egvs.results.study_results import STUDY

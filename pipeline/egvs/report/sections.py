@@ -1,8 +1,4 @@
-"""What the ranking rests on and the evidence of the validation study, in sentences; the section on ``egvs accuracy``.
-
-:func:`ranking_disagreement` compares the EGVS with the recommended score by the evidence of the validation study
-(:mod:`egvs.results.study_results`); a setting that was not measured is not in it.
-"""
+"""What the ranking rests on, in sentences; the section on ``egvs accuracy``."""
 
 from __future__ import annotations
 
@@ -17,30 +13,12 @@ from typing import Any
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import Diagnostic
-from egvs.results.labels import SCORE_LABELS, join_names
-from egvs.results.ranking import Pole, RankedSite
-from egvs.results.study_results import STUDY
+from egvs.results.labels import join_names
+from egvs.results.ranking import Pole
 from egvs.scenario.model import Scenario
-from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.signal_descriptions import ASSUMED_SOURCE, plan_title
-
-COMPARED_SITES = 3
-"""Number of best sites that :func:`ranking_disagreement` compares."""
-
-RHO_RANGE = (
-    "{:.2f} to {:.2f}, depending on junction and detector; among sites of equal height, {:.2f} to {:.2f}".format(
-        *STUDY.larger_study.rho, *STUDY.larger_study.rho_at_equal_height
-    )
-)
-"""Rank correlation of the recommended score with detection, over the held-out junctions and the detectors of the larger
-study (docs/validity.md)."""
-
-FROM_SENSOR_NOTE = (
-    "This detector measures heights from the sensor, and the score for it was tested at "
-    f"{STUDY.heights_from_sensor.sites} sites of one junction only (docs/validity.md)."
-)
 
 NAMED_POLES = 5
 """Poles at the head of the ranking whose location in a lane is stated with the result."""
@@ -174,73 +152,6 @@ def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:
         for count in traffic.counts:
             movements[f"{count.title}{period}"] = names.describe(count.edge or count.from_edge or "", count.to_edge)
     return movements
-
-
-# ---- evidence of the validation study
-
-
-def egvs_setting(gamma: float, voxel_m: float, *, moving_occlusion: bool = False) -> str:
-    """Return the key of an EGVS setting in :attr:`egvs.results.study_results.FirstStudy.rho`."""
-    occlusion = "moving occlusion, " if moving_occlusion else ""
-    return f"egvs (gamma {gamma:g}, {occlusion}voxel {voxel_m:g})"
-
-
-def ranking_disagreement(
-    sites: Sequence[RankedSite],
-    egvs: str,
-    rho: Mapping[str, Mapping[str, float]] = STUDY.first_study.rho,
-    detectors: Sequence[str] = (),
-) -> str:
-    """Return sentences if the EGVS and the recommended score have different best sites; empty otherwise.
-
-    Parameters
-    ----------
-    sites
-        Sites with both scores; the result is empty if one is missing.
-    egvs
-        The EGVS setting of the run, from :func:`egvs_setting`.
-    rho
-        The evidence, by score and detector; that of the first study by default.
-    detectors
-        Detectors that the recommended score stands for.
-    """
-    by_egvs, by_other = best_sites(sites, "egvs"), best_sites(sites, DEFAULT_SCORE)
-    if not by_egvs or not by_other or (by_egvs[0] == by_other[0] and set(by_egvs) == set(by_other)):
-        return ""
-    noun = SCORE_LABELS[DEFAULT_SCORE].noun
-    evidence = FROM_SENSOR_NOTE if FROM_SENSOR in detectors else _describe_evidence(noun, egvs, rho)
-    return f"The best sites by EGVS are {join_names(by_egvs)}; by {noun} they are {join_names(by_other)}. {evidence}"
-
-
-def best_sites(sites: Sequence[RankedSite], name: str) -> tuple[str, ...]:
-    """Return the best sites by one score, equal ones in the order of the sites; empty if a value is missing."""
-    values = [site.value_of(name) for site in sites]
-    if any(value is None for value in values):
-        return ()
-    ranked = sorted(zip(sites, values, strict=True), key=lambda pair: -float(pair[1] or 0.0))
-    return tuple(site.site for site, _ in ranked[:COMPARED_SITES])
-
-
-def _describe_evidence(noun: str, egvs: str, rho: Mapping[str, Mapping[str, float]]) -> str:
-    """Sentences on how well both scores predicted detection in the study."""
-    recommended, this_egvs = rho.get(DEFAULT_SCORE, {}), rho.get(egvs, {})
-    detectors = [detector for detector in recommended if detector in this_egvs]
-    if not detectors:
-        text = "How well this setting of the EGVS predicts detection was not measured."
-        if recommended:
-            text += f" The rank correlation of {noun} with detection is {RHO_RANGE}; see docs/validity.md."
-        return text
-
-    is_better = [recommended[detector] > this_egvs[detector] for detector in detectors]
-    if all(is_better):
-        verdict = f"{noun} was the better predictor of detection"
-    elif any(is_better):
-        verdict = "neither score was consistently the better predictor of detection"
-    else:
-        verdict = "the EGVS was the better predictor of detection"
-    values = join_names([f"{recommended[name]:.2f} against {this_egvs[name]:.2f} ({name})" for name in detectors])
-    where = "At the held-out junctions of the validation study"
-    return f"{where}, {verdict}: mean rank correlation {values}. That of {noun} is {RHO_RANGE}; see docs/validity.md."
 
 
 # ---- egvs accuracy

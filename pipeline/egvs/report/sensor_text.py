@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from egvs.results.labels import SCORE_LABELS
+from egvs.core.wording import by_number
+from egvs.results.labels import SCORE_LABELS, join_names
 from egvs.results.levels import MIN_NOTICED_LEAD
 from egvs.results.sensors import SensorComparison, difference_unit
 from egvs.results.study_results import STUDY
@@ -52,11 +53,42 @@ def describe_losses(*, has_interval: bool) -> str:
     return f"{LOSSES_EVIDENCE} {_INTERVAL_SENTENCE if has_interval else _NO_INTERVAL_SENTENCE}"
 
 
+def sensors_without_losses(scenario: Scenario, sensors: Iterable[str]) -> list[str]:
+    """Return which sensors lose no returns in the simulation, although they may in reality; each once.
+
+    All with ``effects.range_limit = false``; else those without a rated range.
+    """
+    names = list(dict.fromkeys(sensors))
+    if scenario.effects.range_limit is not None:
+        return names if scenario.effects.range_limit is False else []
+    return [name for name in names if scenario_sensor(name, scenario, "sensors").rated_range_m is None]
+
+
 def has_losses(scenario: Scenario, sensors: Iterable[str]) -> bool:
     """Return whether losses of returns of some sensors are simulated, or cannot change the result."""
-    if scenario.effects.range_limit is not None:
-        return scenario.effects.range_limit is not False
-    return all(scenario_sensor(name, scenario, "sensors").rated_range_m is not None for name in set(sensors))
+    return not sensors_without_losses(scenario, sensors)
+
+
+def upper_limit_note(scenario: Scenario, sensors: Iterable[str]) -> str:
+    """Return a sentence if what people would notice is an upper limit, as sensors lose no returns; else empty.
+
+    Parameters
+    ----------
+    scenario
+        The scenario of the run.
+    sensors
+        Names of the sensors for which it is stated what people would notice.
+    """
+    names = sensors_without_losses(scenario, sensors)
+    if not names:
+        return ""
+    reason = "effects.range_limit = false"
+    if scenario.effects.range_limit is not False:
+        reason = f"{by_number(len(names), 'it has', 'they have')} no rated range"
+    return (
+        f"Losses of returns are not simulated for {join_names(names)} ({reason}), but the curves of what people notice "
+        "are for points with losses: read that share as an upper limit."
+    )
 
 
 def range_note(sensors: Iterable[str], *, is_modelled: bool) -> str:

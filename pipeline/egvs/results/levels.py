@@ -1,13 +1,15 @@
-"""Levels: what share of vehicles people notice from a site, and both levels of each group of road users.
+"""Levels: what share of vehicles detectors find and people notice from a site, and both of each group of road users.
 
 A share that rests on what was measured is printed as a number with its error. If more than :data:`MAX_SHARE_OUTSIDE`
-of the vehicles are outside the data of the curves (:mod:`egvs.scoring.noticed`), it is printed as a range: from the
-share if none of these was noticed to the share if all of them were, in steps of 5 %.
+of the vehicles are outside of what it rests on, it is printed as a range: from the share if none of these was found or
+noticed to the share if all of them were, in steps of 5 %. Outside are, for what people notice, those outside the data
+of the curves (:mod:`egvs.scoring.noticed`); for what detectors find, all but :data:`TRAINED_GROUP`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +25,21 @@ MAX_SHARE_OUTSIDE = 0.1
 MIN_NOTICED_LEAD = 0.01
 """Shares noticed that differ by less are taken as equal."""
 
+TRAINED_GROUP = "cars"
+"""The group of road users that the models of detectors were trained on."""
+
 _RANGE_STEP = 0.05
+
+
+def format_range(low: float, high: float) -> str:
+    """Return a range of shares in per cent, rounded outwards to steps of 5 %.
+
+    >>> format_range(0.72, 0.93)
+    '70 to 95 %'
+    """
+    low = math.floor(round(low / _RANGE_STEP, 6)) * _RANGE_STEP
+    high = min(1.0, math.ceil(round(high / _RANGE_STEP, 6)) * _RANGE_STEP)
+    return f"{100.0 * low:.0f} to {format_percent(high, 0)}"
 
 
 @dataclass(frozen=True)
@@ -69,9 +85,7 @@ class NoticedShare:
         """The share, or a range, in per cent: a cell of a table."""
         if self.is_measured:
             return SCORE_LABELS[NOTICED].value(self.value)
-        low = math.floor(round(self.low / _RANGE_STEP, 6)) * _RANGE_STEP
-        high = min(1.0, math.ceil(round(self.high / _RANGE_STEP, 6)) * _RANGE_STEP)
-        return f"{100.0 * low:.0f} to {format_percent(high, 0)}"
+        return format_range(self.low, self.high)
 
 
 @dataclass(frozen=True)
@@ -84,6 +98,8 @@ class GroupLevel:
         Name of the group.
     observations
         Number of road users, counted once in each frame.
+    weight_share
+        Share of the group in the sum of the weights of all road users.
     found, found_se
         Share that detectors should find, and its standard error; None if that is unknown.
     noticed
@@ -92,6 +108,7 @@ class GroupLevel:
 
     road_users: str
     observations: int
+    weight_share: float
     found: float
     found_se: float | None
     noticed: NoticedShare
@@ -100,6 +117,49 @@ class GroupLevel:
     def found_text(self) -> str:
         """The share that detectors should find, with its error."""
         return SCORE_LABELS[DEFAULT_SCORE].with_error(self.found, math.nan if self.found_se is None else self.found_se)
+
+
+@dataclass(frozen=True)
+class FoundRange:
+    """The range of the share that detectors find, where nothing is known of many vehicles; see :func:`found_range`.
+
+    Attributes
+    ----------
+    low, high
+        The share if none, and if all of the vehicles are found that no model was trained on.
+    untrained
+        Share of these vehicles.
+    """
+
+    low: float
+    high: float
+    untrained: float
+
+    @property
+    def text(self) -> str:
+        """The range in per cent, in steps of 5 %."""
+        return format_range(self.low, self.high)
+
+
+def found_range(levels: Sequence[GroupLevel]) -> FoundRange | None:
+    """Return the range of the share that detectors find from a site, where a number would not be supported.
+
+    Parameters
+    ----------
+    levels
+        All groups of road users, from :func:`read_levels`.
+
+    Returns
+    -------
+    FoundRange or None
+        None if at most :data:`MAX_SHARE_OUTSIDE` of the vehicles are not of :data:`TRAINED_GROUP`, or if the groups are
+        unknown.
+    """
+    untrained = math.fsum(level.weight_share for level in levels if level.road_users != TRAINED_GROUP)
+    if not untrained > MAX_SHARE_OUTSIDE:
+        return None
+    low = math.fsum(level.weight_share * level.found for level in levels if level.road_users == TRAINED_GROUP)
+    return FoundRange(low, low + untrained, untrained)
 
 
 GROUPS_NOTE = (
@@ -119,5 +179,5 @@ def read_levels(path: Path, site: str) -> tuple[GroupLevel, ...]:
             continue
         noticed = NoticedShare(row[NOTICED], row.get(f"{NOTICED}_se"), row["noticed_low"], row["noticed_high"])
         found = row[DEFAULT_SCORE], row.get(f"{DEFAULT_SCORE}_se")
-        levels.append(GroupLevel(row["road_users"], row["observations"], *found, noticed))
+        levels.append(GroupLevel(row["road_users"], row["observations"], row["weight_share"], *found, noticed))
     return tuple(levels)

@@ -284,8 +284,8 @@ class SensorPlan:
     refinement
         With refined poses, what the refinement did; ``sensors``, ``joint``, ``cost`` and ``zones`` are those after it.
     fused
-        What the sensors are expected to find in their fused point clouds; None in a plan that was read, for one sensor,
-        and for joint scores that do not take sensors as independent.
+        What the sensors are expected to find in their fused point clouds; None in a plan that was read, without
+        sensors, and for joint scores that do not take sensors as independent.
     zone_results
         What the sensors find together in the zones of ``[score] zones``; empty in a plan that was read.
     files

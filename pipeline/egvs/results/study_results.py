@@ -31,7 +31,7 @@ class FirstStudy(_Results):
     ----------
     rho
         Rank correlation (Spearman's rho) with AP (mean of BEV and 3D, IoU 0.7): score -> detector -> mean rho. The EGVS
-        has one entry per setting, named by :func:`egvs.report.sections.egvs_setting`.
+        has one entry per setting, named by :func:`egvs.report.ranking_text.egvs_setting`.
     """
 
     rho: dict[str, dict[str, float]]

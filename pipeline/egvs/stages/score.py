@@ -28,6 +28,7 @@ from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED, SCORES_IN_UNITS
 from egvs.scoring import score_table, standard_errors, zones
 from egvs.scoring.score_table import ScoreTable
 from egvs.scoring.target_scores import group_score
+from egvs.scoring.targets import weighted_mean
 from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
@@ -202,12 +203,14 @@ def _write_levels(context: StageContext, scoring: SiteScoring, scores: ScoreTabl
     if scoring.targets is None or not scoring.targets.levels:
         context.folder.levels.unlink(missing_ok=True)
         return
-    levels = scoring.targets.levels
-    observations = [np.count_nonzero(members * scoring.targets.weight) for members in levels.values()]
+    levels, weight = scoring.targets.levels, scoring.targets.weight
+    observations = [np.count_nonzero(members * weight) for members in levels.values()]
+    weight_shares = [weighted_mean(members, weight) for members in levels.values()]
     columns: dict[str, Any] = {
         "site": np.repeat(np.array(scores.sites, dtype=object), len(levels)),
         "road_users": list(levels) * len(scores.sites),
         "observations": observations * len(scores.sites),
+        "weight_share": weight_shares * len(scores.sites),
     }
     errors = []
     for name in (DEFAULT_SCORE, NOTICED, *NOTICED_BOUNDS):

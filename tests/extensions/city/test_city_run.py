@@ -29,6 +29,7 @@ from egvs.traffic import recording
 from tests.extensions.city.real_cluster import START_TIMEOUT_S, RealCluster, wait_until
 
 pytestmark = pytest.mark.system
+NOTICED_COLUMNS = ("noticed", "noticed_low", "noticed_high")
 HAS_COSTS = ("report.html", "run.json", "costs.json", ".lock", ".digests.json")
 
 
@@ -72,6 +73,9 @@ def test_joins_scores_and_ranks_junctions(city: City, tmp_path: Path) -> None:
     for row in table.to_pylist():
         assert row["egvs"] == row["score"] == best[row["junction"]]
     assert table.column("rank").to_pylist() == [1, 2]
+    for row in table.to_pylist():  # both numbers of the best site
+        (site,) = (s for s in scores.to_pylist() if (s["junction"], s["site"]) == (row["junction"], row["best"]))
+        assert [row[name] for name in NOTICED_COLUMNS] == [site[name] for name in NOTICED_COLUMNS]
     html = (ran.out / "city.html").read_text()
     assert re.findall(r'href="(junctions/\w+/report\.html)"', html)[-2:] == [
         "junctions/west/report.html", "junctions/east/report.html",

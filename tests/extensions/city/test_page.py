@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from egvs.core.errors import Diagnostic
 from egvs.extensions.city import page
 from egvs.extensions.city.model import City, CityJunction
 from egvs.extensions.city.results import BudgetPoint, CityPlan, JunctionResult
-from egvs.results.ranking import RankedSite
+from egvs.results.ranking import RankedSite, ScoreValue
 from egvs.scenario.traffic_config import TrafficConfig
 
 MARKUP = '<script>alert("x")</script> & "Sons"'
@@ -37,6 +38,17 @@ def test_shows_best_junction_warnings_and_attribution() -> None:
     assert "<b>where</b>: problem. <small>hint</small>" in html
     assert "© the mappers" in html
     assert html.count('class="plan"') == 2  # by gain, and by the share that is seen
+
+
+def test_shows_what_people_notice_where_it_is_known_for_all_junctions() -> None:
+    known, other = make_result("a", 1, 90.0), make_result("b", 2, 30.0)
+    shares = {"others": (ScoreValue("noticed", 0.9, 0.02),), "noticed_low": 0.9, "noticed_high": 0.9}
+    known = replace(known, best=replace(known.best, **shares))
+    wide = replace(other, best=replace(other.best, **shares | {"noticed_low": 0.61}))
+    html = page.render_page(make_city(known, wide), (known, wide), [])
+    assert '<td class="n" data-label="Noticed" data-value="0.9">90 %</td>' in html.replace("\u00a0", " ")
+    assert '<td class="n" data-label="Noticed" data-value="0.9">60 to 90 %</td>' in html.replace("\u00a0", " ")
+    assert "Noticed" not in page.render_page(make_city(known, other), (known, other), [])
 
 
 def make_plan(requested: str, phases: tuple[int, ...] = (), se: float = 2.0) -> CityPlan:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -43,6 +44,17 @@ def evidence(counts=(0, 1, 2), hits=(2, 2, 1), ends=ENDS, returned=None, in_traf
     )
     returned = np.ones(len(ends), dtype=np.bool_) if returned is None else np.array(returned)
     return SiteEvidence(Occupancy(tpog), beams, returned, lambda _: counted, lambda _: vehicles, **more)
+
+
+@dataclass
+class FakeVehicles:
+    """Points on the vehicles of a record."""
+
+    record: SimpleNamespace
+    points: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
 
 
 def value(name: str, given: SiteEvidence, **parameters: object) -> float:
@@ -190,6 +202,16 @@ def test_points_on_target():
     assert value("points_on_target", evidence(in_traffic_points=(0.0, math.e - 1, math.e**3 - 1))) == pytest.approx(
         (0 + 1 + 3) / 3
     )
+
+
+def test_noticed_is_a_mean_over_curves_of_each_group():
+    """A car and a bus with 14.142 points, the node of 10 to 20 points, and a car without any."""
+    record = SimpleNamespace(kinds=("passenger", "bus"), kind=np.array([0, 1, 0]))
+    vehicles = FakeVehicles(record, np.array([math.sqrt(200.0), math.sqrt(200.0), 0.0]))
+    given = replace(evidence(), count_points=lambda _: vehicles)
+    assert value("noticed", given) == pytest.approx((0.6 + 0.8092 + 0.0) / 3, abs=1e-5)
+    nobody = FakeVehicles(SimpleNamespace(kinds=(), kind=np.zeros(0, dtype=np.int64)), np.zeros(0))
+    assert math.isnan(value("noticed", replace(evidence(), count_points=lambda _: nobody)))
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def values(scores, score, **parameters):
 def test_one_row_per_site_score_and_parameters(computed):
     scenario, _, scores = computed
     tried = [(row.site, row.score, row.parameters_json) for row in scores.rows]
-    assert len(set(tried)) == len(tried) == 2 * (len(GAMMAS) * 3 * 2 + 15 + 2 + 18)
+    assert len(set(tried)) == len(tried) == 2 * (len(GAMMAS) * 3 * 2 + 16 + 2 + 18)
     assert list(dict.fromkeys(row.site for row in scores.rows)) == ["pole_a", "pole_b"]
     assert list(dict.fromkeys(row.score for row in scores.rows)) == surrogates.score_names()
     gammas = {row.parameters["gamma"] for row in scores.rows if row.score == "egvs"}

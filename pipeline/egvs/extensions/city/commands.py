@@ -247,7 +247,9 @@ def describe_done(done: JobResult) -> str:
 def print_junctions(city_run: CityRun) -> None:
     """Print the junctions, best first, and the files that were written."""
     from egvs.cli.console import NARROW, WIDE, Column, console, make_table
-    from egvs.extensions.city.results import gain_label
+    from egvs.extensions.city.results import gain_label, has_noticed
+    from egvs.results.labels import SCORE_LABELS
+    from egvs.scenario.score_config import NOTICED
 
     by = city_run.results[0].best.by
     gain = gain_label(by.name)
@@ -260,6 +262,8 @@ def print_junctions(city_run: CityRun) -> None:
     ]
     if by.head != gain.head:
         columns.append(Column(by.head, lambda row: by.value(row.score)))
+    if has_noticed(city_run.results):
+        columns.append(Column(SCORE_LABELS[NOTICED].head, lambda row: row.best.noticed_cell))
     if "entropy seen" not in (gain.head, by.head):
         columns.append(Column("entropy seen", lambda row: format_percent(row.best.entropy_seen)))
     columns.append(Column("vehicles", lambda row: f"{row.vehicles:.1f}"))

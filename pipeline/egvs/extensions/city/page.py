@@ -23,7 +23,16 @@ from egvs.drawing import colours, maps, pages
 from egvs.drawing.svg_figures import Box, ColourBar, MapFrame
 from egvs.extensions.city.budget_figure import budget_chart, curve_rows
 from egvs.extensions.city.model import NETWORK_FILE, City
-from egvs.extensions.city.results import RUNS_FOLDER, CityPlan, JunctionResult, counts_vehicles, gain_label
+from egvs.extensions.city.results import (
+    RUNS_FOLDER,
+    CityPlan,
+    JunctionResult,
+    counts_vehicles,
+    gain_label,
+    has_noticed,
+)
+from egvs.results.labels import SCORE_LABELS
+from egvs.scenario.score_config import NOTICED
 from egvs.traffic import network
 
 PAGE_FILE = "city.html"
@@ -189,6 +198,7 @@ def render_page(
         results=results,
         score=score,
         is_egvs=score.name == "egvs",
+        noticed=SCORE_LABELS[NOTICED] if has_noticed(results) else None,
         gain=gain_label(score.name),
         headline=format_headline(results),
         links={result.junction.id: report_link(result) for result in results},

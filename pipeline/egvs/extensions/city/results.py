@@ -240,6 +240,11 @@ def counts_vehicles(rank_by: str) -> bool:
     return rank_by in _VEHICLE_LABELS
 
 
+def has_noticed(results: Sequence[JunctionResult]) -> bool:
+    """Return whether it is known for each junction what people notice from its best site."""
+    return all(result.best.noticed is not None for result in results)
+
+
 def score_factor(rank_by: str, vehicles: float) -> float:
     """Return the factor that makes scores of different junctions comparable and additive.
 
@@ -307,9 +312,20 @@ def write_results(out: Path, city: City, results: Sequence[JunctionResult]) -> t
     names = [result.junction.id for result in results]
     _write_scores(out, names)
     rows = [_table_row(result) for result in results]
-    columns = {column: [row[column] for row in rows] for column in rows[0]}
+    columns: dict[str, Any] = {column: [row[column] for row in rows] for column in rows[0]}
     metadata = {**_common_metadata(city, hash_scores(out, names)), "rank_by": results[0].best.rank_by}
-    parquet.write_artefact(out / JUNCTIONS_TABLE, "city", columns, metadata)
+    optional: tuple[str, ...] = ()
+    if has_noticed(results):
+        shares = [result.best.noticed for result in results if result.best.noticed is not None]
+        columns |= {
+            "noticed": [share.value for share in shares],
+            "noticed_low": [share.low for share in shares],
+            "noticed_high": [share.high for share in shares],
+        }
+        optional = parquet.optional_columns("city")
+    with parquet.artefact_writer(out / JUNCTIONS_TABLE, "city", optional) as file:
+        file.write(columns)
+        file.describe(metadata)
     return out / JUNCTIONS_TABLE, out / SCORES_DATASET
 
 

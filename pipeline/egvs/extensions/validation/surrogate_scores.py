@@ -29,7 +29,9 @@ from egvs.extensions.validation.surrogates import (
     SurrogateScore,
 )
 from egvs.scoring import target_scores
+from egvs.scoring.noticed import noticed_chances
 from egvs.scoring.scorer import OccupiedVoxels
+from egvs.scoring.targets import weighted_mean
 
 # ---- scores of voxels
 
@@ -198,6 +200,11 @@ def expected_detections(evidence: SiteEvidence, detectors: str) -> float:
     return target_scores.expected_detections(evidence.vehicles, detectors.split("+"))
 
 
+def noticed(evidence: SiteEvidence) -> float:
+    """Return the share of vehicles that people notice, from points; NaN without any vehicle."""
+    return weighted_mean(noticed_chances(evidence.vehicles))
+
+
 # ---- entry points
 
 EGVS = SurrogateScore(
@@ -310,4 +317,12 @@ EXPECTED_DETECTIONS = SurrogateScore(
     expected_detections,
     ("vehicles",),
     {"detectors": ("+".join(target_scores.DETECTORS), *target_scores.DETECTORS)},
+)
+NOTICED = SurrogateScore(
+    "noticed",
+    "share of vehicles that people notice within 3 m, from points; it does not ask how well a box fits, as AP does",
+    "this program, with labels of Zimmer et al. 2023, arXiv 2306.09266",
+    1,
+    noticed,
+    ("vehicles",),
 )

@@ -235,6 +235,7 @@ SCORES_GROUP = "egvs.scores"
 _BUILTIN_SCORES = (
     "egvs", "entropy_seen", "coverage", "expected_visibility", "s_mig", "m_sog", "kl_obs", "density", "uniformity",
     "nuc", "perception_entropy", "vehicle_grid_occupancy", "points_on_target", "seen_well", "expected_detections",
+    "noticed",
 )  # fmt: skip
 """The scores of this program, in the order of tables."""
 
