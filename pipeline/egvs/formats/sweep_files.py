@@ -5,12 +5,11 @@ A file is a sweep, and so is each array of an ``.npz`` file. The formats are tho
 (right-handed, z along the axis of rotation), metres. Missing returns (NaN, infinite, or within 5 cm of the origin, as
 many drivers write zeros for them) stay in the list, because their positions tell which pulses gave no return.
 
-Recordings of ROS (:mod:`egvs.extensions.hardware.recordings.ros_bags`) and network captures
-(:mod:`egvs.extensions.hardware.recordings.velodyne_pcap`) hold many sweeps, of which some are read, spread evenly.
+Recordings of ROS and network captures (readers of the extension hardware) hold many sweeps, of which some are read,
+spread evenly.
 
-Nothing in a file's header says how its points are ordered; :mod:`egvs.extensions.hardware.fit.sweep_layout` finds out.
-Many files say of each point which ring it is from
-(:data:`egvs.formats.recordings.RING_FIELDS`).
+Nothing in a file's header says how its points are ordered; fitting a sensor finds out. Many files say of each point
+which ring it is from (:data:`egvs.formats.recordings.RING_FIELDS`).
 """
 
 from __future__ import annotations

@@ -210,9 +210,9 @@ def warn_equal_sites(inputs: CheckInputs) -> Iterator[Diagnostic]:
             equal.append(f"{site.name} = {first}")
     if equal:
         verb = by_number(len(equal), "has", "have")
-        problem = f"{number_of(len(equal), 'site')} {verb} the pose and the sensor of another one:"
-        hint = "List each candidate once."
-        yield Diagnostic("equal sites", "sites", f"{problem} {list_first(equal, MAX_LISTED_SITES)}", hint)
+        names = list_first(equal, MAX_LISTED_SITES)
+        problem = f"{number_of(len(equal), 'site')} {verb} the pose and the sensor of another one: {names}"
+        yield Diagnostic("equal sites", "sites", problem, "List each candidate once.")
 
 
 def warn_sites_on_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
