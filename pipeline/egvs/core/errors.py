@@ -173,7 +173,7 @@ class DiagnosticsError(InputError):
         super().__init__(first.where, first.problem, "\n".join([first.hint, *map(str, others)]))
 
 
-_UNIT_SUFFIX = re.compile(r"[_ ]?(m|deg|rad)$")
+_UNIT_SUFFIX = re.compile(r"[_ ]*[(\[]?(m|deg|rad|°)[)\]]?$")
 _MIN_SIMILARITY = 0.8
 """Names that share more of their letters than this are similar."""
 _MAX_NAME_LENGTH = 80

@@ -25,7 +25,7 @@ import numpy as np
 from egvs.core import files, limits, readers
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.reading import COMPLETE_FILE
+from egvs.core.reading import COMPLETE_FILE, translate_errors
 from egvs.extensions.hardware.recordings.recording_options import RecordingOptions
 from egvs.extensions.hardware.recordings.recordings import RecordedSweep, Recording
 from egvs.formats import point_clouds
@@ -157,7 +157,7 @@ def _read_file(path: Path, name: str) -> list[Sweep]:
 
 
 def _read_npz(path: Path, name: str) -> Iterator[Sweep]:
-    try:
+    with translate_errors(name, doing="cannot be read as .npz"):
         with path.open("rb") as file, zipfile.ZipFile(file) as archive, np.load(file, allow_pickle=False) as arrays:
             unpacked = sum(member.file_size for member in archive.infolist())
             limits.UNPACKED.check_bytes(name, unpacked, f"has {unpacked / limits.MB:,.0f} MB after decompression")
@@ -173,8 +173,6 @@ def _read_npz(path: Path, name: str) -> Iterator[Sweep]:
                 limits.POINTS.check(f"{name}: {key}", len(array))
                 points = array[:, :3].astype(np.float64)
                 yield _clean_sweep(f"{name}: {key}", points, array.dtype == np.float16)
-    except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile) as error:
-        raise InputError(name, f"cannot be read as .npz ({error})", COMPLETE_FILE) from None
 
 
 def _clean_sweep(name: str, points_m: FloatArray, is_coarse: bool = False) -> Sweep:
