@@ -165,13 +165,13 @@ def test_library_versions_are_those_installed() -> None:
 
 
 MOST_LINES = {
-    "check": 16_600,  # with comparisons of heights, of vehicles with roads and of limits
-    "statics": 9_800,
+    "check": 16_700,  # with comparisons of heights, of vehicles with roads and of limits
+    "statics": 9_900,
     "scan": 12_300,
     "traffic": 10_500,
     "tpog": 4_100,
-    "score": 16_800,
-    "report": 19_800,
+    "score": 16_900,
+    "report": 19_900,
 }
 """Code lines behind the key of each stage, at most: a stage runs again whenever one of them changes."""
 

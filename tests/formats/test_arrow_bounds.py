@@ -118,7 +118,9 @@ def test_footer_of_parquet_is_read_as_arrow_reads_it(tmp_path: Path, rows: int) 
     assert len(groups) == metadata.num_row_groups
     for number, chunks in enumerate(groups):
         columns = [metadata.row_group(number).column(i) for i in range(metadata.num_columns)]
-        expected = [(c.path_in_schema, c.num_values, c.total_compressed_size, c.dictionary_page_offset) for c in columns]
+        expected = [
+            (c.path_in_schema, c.num_values, c.total_compressed_size, c.dictionary_page_offset) for c in columns
+        ]
         assert [(c.name, c.values, c.packed_bytes, c.start) for c in chunks] == expected
 
 

@@ -236,12 +236,12 @@ def _make_resolver(source: Path) -> trimesh.resolvers.Resolver:
     """
     from trimesh.resolvers import FilePathResolver
 
-    folder = Path(os.path.abspath(source.parent))
+    folder = Path(os.path.normpath(source.parent))
 
     class Resolver(FilePathResolver):  # type: ignore[misc]
         def get(self, name: str) -> bytes:
             for path in _existing_files(source, (name, name.strip(), unquote(name))):
-                if Path(os.path.abspath(path)).is_relative_to(folder):
+                if Path(os.path.normpath(path)).is_relative_to(folder):
                     return limits.read_bytes(path, limits.FILE)
             raise FileNotFoundError(f"{name[:80]!r} is no file in the folder of the mesh")
 

@@ -366,8 +366,11 @@ class _RowBatch:
         self._where = f"{path}: {unit}"
         is_nameless = pc.and_not(np.isfinite(_floats(batch.column("x"))), has_vehicle)
         for i in _true_positions(is_nameless):
-            hint = "Write the name of each vehicle. A row without a vehicle has only a time."
-            raise InputError(f"{self._where} {i + rows_before + 1}", "expected a name with the position, got none", hint)
+            where, hint = (
+                f"{self._where} {i + rows_before + 1}",
+                "Name each vehicle; a row without one has only a time.",
+            )
+            raise InputError(where, "expected a name with the position, got none", hint)
 
     def check_types(self) -> None:
         import pyarrow.compute as pc

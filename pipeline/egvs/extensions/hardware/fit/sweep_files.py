@@ -157,22 +157,26 @@ def _read_file(path: Path, name: str) -> list[Sweep]:
 
 
 def _read_npz(path: Path, name: str) -> Iterator[Sweep]:
-    with translate_errors(name, doing="cannot be read as .npz"):
-        with path.open("rb") as file, zipfile.ZipFile(file) as archive, np.load(file, allow_pickle=False) as arrays:
-            unpacked = sum(member.file_size for member in archive.infolist())
-            limits.UNPACKED.check_bytes(name, unpacked, f"has {unpacked / limits.MB:,.0f} MB after decompression")
-            if not arrays.files:
-                raise InputError(name, "expected an array for each sweep, got none", _NPZ_HINT)
-            for key in arrays.files:
-                array = arrays[key]
-                if not isinstance(array, np.ndarray):
-                    raise InputError(f"{name}: {key}", "expected an array, got another file", _NPZ_HINT)
-                if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
-                    problem = f"expected numbers of shape (n, 3), got {array.dtype} of shape {array.shape}"
-                    raise InputError(f"{name}: {key}", problem, _NPZ_HINT)
-                limits.POINTS.check(f"{name}: {key}", len(array))
-                points = array[:, :3].astype(np.float64)
-                yield _clean_sweep(f"{name}: {key}", points, array.dtype == np.float16)
+    with (
+        translate_errors(name, doing="cannot be read as .npz"),
+        path.open("rb") as file,
+        zipfile.ZipFile(file) as archive,
+        np.load(file, allow_pickle=False) as arrays,
+    ):
+        unpacked = sum(member.file_size for member in archive.infolist())
+        limits.UNPACKED.check_bytes(name, unpacked, f"has {unpacked / limits.MB:,.0f} MB after decompression")
+        if not arrays.files:
+            raise InputError(name, "expected an array for each sweep, got none", _NPZ_HINT)
+        for key in arrays.files:
+            array = arrays[key]
+            if not isinstance(array, np.ndarray):
+                raise InputError(f"{name}: {key}", "expected an array, got another file", _NPZ_HINT)
+            if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+                problem = f"expected numbers of shape (n, 3), got {array.dtype} of shape {array.shape}"
+                raise InputError(f"{name}: {key}", problem, _NPZ_HINT)
+            limits.POINTS.check(f"{name}: {key}", len(array))
+            points = array[:, :3].astype(np.float64)
+            yield _clean_sweep(f"{name}: {key}", points, array.dtype == np.float16)
 
 
 def _clean_sweep(name: str, points_m: FloatArray, is_coarse: bool = False) -> Sweep:
