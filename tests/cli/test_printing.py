@@ -22,6 +22,15 @@ def test_brackets_and_colons_are_no_styles(capsys: pytest.CaptureFixture[str]) -
     assert capsys.readouterr().out.split() == ["[bold]", "pole:car:[red]"]
 
 
+@pytest.mark.parametrize("control", ["\x1b[31m", "\x9b31m", "\u202e", "\x07"])
+def test_names_do_not_control_the_terminal(capsys: pytest.CaptureFixture[str], control: str) -> None:
+    console(100).print(make_table([Column(f"{control}title", str)], [f"{control}pole"]))
+    console(100).print(f"the best is {control}pole")
+    out = capsys.readouterr().out
+    assert control[0] not in out
+    assert out.count(control[0].encode("unicode_escape").decode()) == 3
+
+
 def test_a_bar_takes_no_name_for_markup() -> None:
     from io import StringIO
 

@@ -254,6 +254,7 @@ TRIALS = {
 }  # fmt: skip
 
 ELSEWHERE = {
+    "EGVS_MAX_EDGE_PAIRS": "tests/world/test_footprints.py",
     "EGVS_MAX_READER_S": "test_time_of_a_confined_reader_has_a_limit",
     "EGVS_MAX_SUMO_MB": "tests/traffic/test_sumo_limits.py",
     "EGVS_MAX_SUMO_S": "tests/traffic/test_sumo_limits.py",

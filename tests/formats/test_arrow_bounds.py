@@ -96,6 +96,34 @@ def test_false_sizes_of_parquet_are_not_believed(tmp_path: Path, monkeypatch: py
     assert sum(table.num_rows for table in fcd.read_fcd(path)) == 200_000
 
 
+def test_inconsistent_statistics_of_parquet_are_an_error(tmp_path: Path) -> None:
+    """Arrow's description of such a column ends the program."""
+    path = tmp_path / "f.parquet"
+    pq.write_table(fcd_table(), path)
+    optional, required = b"\x25\x02\x18\x05angle", b"\x25\x00\x18\x05angle"
+    data = path.read_bytes()
+    assert data.count(optional) == 1
+    path.write_bytes(data.replace(optional, required))
+    with pytest.raises(InputError, match=r"f\.parquet: cannot be read as Parquet"):
+        list(fcd.read_fcd(path))
+
+
+@pytest.mark.parametrize("rows", [1, 70_000])
+def test_footer_of_parquet_is_read_as_arrow_reads_it(tmp_path: Path, rows: int) -> None:
+    path = tmp_path / "f.parquet"
+    pq.write_table(fcd_table(rows), path, row_group_size=20_000)
+    metadata = pq.read_metadata(path)
+    with path.open("rb") as file:
+        groups = arrow_bounds.read_parquet_groups(file)
+    assert len(groups) == metadata.num_row_groups
+    for number, chunks in enumerate(groups):
+        columns = [metadata.row_group(number).column(i) for i in range(metadata.num_columns)]
+        expected = [
+            (c.path_in_schema, c.num_values, c.total_compressed_size, c.dictionary_page_offset) for c in columns
+        ]
+        assert [(c.name, c.values, c.packed_bytes, c.start) for c in chunks] == expected
+
+
 def test_long_text_in_each_row_is_not_repeated(tmp_path: Path) -> None:
     """A text of 100 kB that a dictionary contains once: 2 GB in 20,000 rows."""
     path = tmp_path / "f.parquet"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -105,6 +106,31 @@ def test_rejects_damaged_or_hostile_mesh(
         load_mesh(tmp_path / name, str(tmp_path / name))
     assert str(caught.value).startswith(f"{tmp_path / name}: ")
     assert capfd.readouterr() == ("", "")
+
+
+TEXTURED = b"mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n"
+
+
+@pytest.mark.parametrize("pipe", ["m.mtl", "wall.png"])
+def test_pipe_in_place_of_a_material_is_not_opened(tmp_path: Path, pipe: str) -> None:
+    (tmp_path / "m.obj").write_bytes(TEXTURED)
+    (tmp_path / "m.mtl").write_bytes(b"newmtl a\nmap_Kd wall.png\n")
+    (tmp_path / pipe).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / pipe)
+    assert len(load_mesh(tmp_path / "m.obj", "m.obj").faces) == 1
+
+
+@pytest.mark.parametrize("name", ["points.bin", "../points.bin", "/dev/zero"])
+def test_buffer_that_is_no_file_in_the_folder_is_not_opened(tmp_path: Path, name: str) -> None:
+    document = json.loads(box_file("gltf"))
+    document["buffers"][0]["uri"] = name
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    (folder / "m.gltf").write_text(json.dumps(document))
+    os.mkfifo(folder / "points.bin")
+    (tmp_path / "points.bin").write_bytes(bytes(1000))
+    with pytest.raises(InputError, match=f"m.gltf: cannot be loaded .*{name}' is no file in the folder of the mesh"):
+        load_mesh(folder / "m.gltf", "m.gltf")
 
 
 @pytest.mark.parametrize("name", COMPLETE_FILES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -145,6 +146,26 @@ def test_truncated_part_of_shapefile_is_rejected(located: Path, suffix: str) -> 
         part.write_bytes(data[:size])
         with pytest.raises(InputError, match=rf"poles\{suffix}: {problem}"):
             candidates(located, "poles.shp")
+
+
+def test_shapefile_without_attributes_is_rejected(located: Path) -> None:
+    path = write(located / "poles.shp", frame_of({"site": ["a", "b"], "z_m": [3.0, 3.0]}))
+    path.with_suffix(".dbf").rename(path.with_suffix(".DBF"))
+    assert len(candidates(located, "poles.shp")) == 2
+    path.with_suffix(".DBF").unlink()
+    with pytest.raises(InputError, match=r"poles\.shp: its file of attributes, .* is missing. Add poles\.dbf"):
+        candidates(located, "poles.shp")
+
+
+@pytest.mark.parametrize("name", ["poles.gpkg", "poles.shp"])
+@pytest.mark.parametrize("part", ["poles.gpkg-wal", "poles.prj", "poles.aux.xml"])
+def test_pipes_named_like_parts_of_a_file_are_rejected(located: Path, name: str, part: str) -> None:
+    """GDAL opens them and waits."""
+    write(located / name, frame_of({"site": ["a", "b"], "z_m": [3.0, 3.0]}))
+    (located / part).unlink(missing_ok=True)
+    os.mkfifo(located / part)
+    with pytest.raises(InputError, match=rf"{part}: expected a file, got a pipe or a device"):
+        candidates(located, name)
 
 
 def test_geometries_other_than_points_are_rejected(located: Path) -> None:

@@ -274,8 +274,8 @@ def test_run_from_geojson_has_the_scores_of_csv(mini: Path, tmp_path: Path) -> N
         (collection(point(0, 0, 3, name="")), "feature 0.*site is missing"),
         (collection(point(0, 0, 3, name="a/b")), "feature 0: site.*'a/b'"),
         (collection(point(0, 0, 3, name="a"), point(1, 0, 3, name="a")), "feature 1.*two sites 'a'"),
-        *((collection(point(0, 0, 3, **{"name": "a", key: 90})), f"unknown column '{key}'. Did you mean yaw_deg[?]")
-          for key in ("yaw", "Yaw_deg", "yaw_dge", "yaw_rad", "yawdeg")),
+        *((collection(point(0, 0, 3, **{"name": "a", key: 90})), f"column '{re.escape(key)}'. Did you mean yaw_deg[?]")
+          for key in ("yaw", "Yaw_deg", "yaw_dge", "yaw_rad", "yawdeg", "yaw [°]", "Yaw (deg)")),
         (collection(point(0, 0, 3, name="a", pitch_deg=91)), "feature 0: pitch_deg.*91"),
         (collection(point(0, 0, 3, name="a", yaw_deg="north")), "feature 0: yaw_deg.*'north'"),
         (collection(point(0, 0, math.nan, name="a")), "feature 0: z_m.*nan"),

@@ -201,6 +201,14 @@ def test_vehicles_without_roads_need_the_ground(street: Path) -> None:
     ]
 
 
+def test_vehicles_somewhat_above_the_ground_are_a_warning(street: Path) -> None:
+    record(street, 2.0, with_roads=False)
+    (told,) = heights(street)
+    assert "vehicles drive 2.0 m above the ground at z = 0 (median)" in told
+    record(street, 0.5, with_roads=False)
+    assert heights(street) == []
+
+
 def test_solids_without_roads_are_compared_with_the_traffic(street: Path) -> None:
     record(street, 0.0, with_roads=False)
     statics(street, house(0.0))

@@ -136,6 +136,7 @@ BAD = {
         r"the columns 'vehicle_x' and 'vehicle_x' both stand for 'x'",
     ),
     "time and timestep_time": (f"{HEADER};time\n{row()};1\n".encode(), r"both stand for 'time'"),
+    "no name given": (f"{HEADER}\n{row()}\n{row(id='')}\n".encode(), r"row 2: expected a name with the position, got"),
     "no type given": (f"{HEADER}\n{row(type='')}\n".encode(), r"row 1: vehicle 'v' has no type"),
     "time runs back": (f"{HEADER}\n{row(time='2')}\n{row()}\n".encode(), r"row 2: time 1 s comes after 2 s"),
     "time too fine": (f"{HEADER}\n{row(time='0.0005')}\n".encode(), r"row 1: .*milliseconds, got time 0\.000500 s"),

@@ -1,12 +1,14 @@
 """Footprints are built as they are given, repaired with a count, or rejected with a reason; none is dropped."""
 
 import math
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from egvs.core.errors import DiagnosticsError, InputError
+from egvs.world.footprints import to_polygons
 from tests.conftest import collection, feature
 from tests.world.static_worlds import COURT, FRAME, HOLE, SQUARE, build, build_located, polygon, volumes
 
@@ -177,6 +179,17 @@ def test_reports_all_wrong_features_at_once(tmp_path: Path) -> None:
     assert "feature 1 (t): height_m: expected metres, at most 1e+08, got 'tall'" in messages[0]
     assert "feature 2 (w0): height_m is missing" in messages[1]
     assert "4 more invalid features" in messages[-1]
+
+
+@pytest.mark.parametrize("kind", ["Polygon", "LineString", "MultiPoint"])
+def test_number_of_edges_side_by_side_has_a_limit(kind):
+    """Two thousand corners have a million crossings; ten thousand took all memory."""
+    angle = np.pi * 2 * (999 * np.arange(2000) % 2001) / 2001
+    star = np.column_stack([20 * np.cos(angle), 20 * np.sin(angle)]).round(6).tolist()
+    star.append(star[0])
+    geometry = {"type": kind, "coordinates": [star] if kind == "Polygon" else star}
+    with pytest.raises(InputError, match=r"1,000,000 pairs of edges side by side\. The limit is .*EGVS_MAX_EDGE_PAIRS"):
+        to_polygons(geometry, {"radius_m": 20}, "star", Counter(), keep_crossing_parts=True)
 
 
 def test_number_of_holes_has_a_limit(tmp_path, monkeypatch):

@@ -18,7 +18,7 @@ from rich.text import Text
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.cli import stage_summary
-from egvs.core.errors import collect_warnings
+from egvs.core.errors import collect_warnings, escape_control_characters
 from egvs.core.wording import format_percent
 
 NARROW, WIDE = 110, 190
@@ -58,13 +58,20 @@ class Column(Generic[Row]):
     min_width: int = 0
 
 
+class _PlainConsole(Console):
+    """Prints names that files contain without what in them would control the terminal."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        return super().render_str(escape_control_characters(text), **options)
+
+
 def console(file_width: int, *, soft_wrap: bool = True) -> Console:
     """Return standard output: as wide as the terminal, or ``file_width`` characters if it is no terminal.
 
     Text is never taken for markup or an emoji: names may have brackets and colons.
     """
     width = None if sys.stdout.isatty() else file_width
-    return Console(width=width, highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap)
+    return _PlainConsole(width=width, highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap)
 
 
 def print_sentences(sentences: Iterable[str]) -> None:
@@ -176,7 +183,7 @@ class ProgressDisplay:
         self._part = ""
         self._part_seconds = 0.0
         self._part_states: set[str] = set()
-        self._console = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
+        self._console = _PlainConsole(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),  # names may have brackets
             BarColumn(),

@@ -94,7 +94,12 @@ def _truncate_line(line: str) -> str:
     if len(line) > MAX_LINE_LENGTH:
         end = MAX_LINE_LENGTH // 4
         line = f"{line[: MAX_LINE_LENGTH - end]} ... ({len(line):,} characters) ... {line[-end:]}"
-    return _CONTROL_CHARACTERS.sub(lambda match: match[0].encode("unicode_escape").decode("ascii"), line)
+    return escape_control_characters(line)
+
+
+def escape_control_characters(text: str) -> str:
+    """Return a text in which characters that control a terminal, except tabs and line breaks, are escapes."""
+    return _CONTROL_CHARACTERS.sub(lambda match: match[0].encode("unicode_escape").decode("ascii"), text)
 
 
 WARNINGS_KEY = "warnings"
@@ -173,7 +178,7 @@ class DiagnosticsError(InputError):
         super().__init__(first.where, first.problem, "\n".join([first.hint, *map(str, others)]))
 
 
-_UNIT_SUFFIX = re.compile(r"[_ ]?(m|deg|rad)$")
+_UNIT_SUFFIX = re.compile(r"[_ ]*[(\[]?(m|deg|rad|°)[)\]]?$")
 _MIN_SIMILARITY = 0.8
 """Names that share more of their letters than this are similar."""
 _MAX_NAME_LENGTH = 80

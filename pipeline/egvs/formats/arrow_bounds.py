@@ -15,6 +15,7 @@ import io
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -40,6 +41,10 @@ _REPEATING = {7: "DELTA_BYTE_ARRAY"}
 _KIND, _UNPACKED_SIZE, _PACKED_SIZE = 1, 2, 3
 """Fields of a PageHeader."""
 _DICTIONARY_PAGE = 2
+_ROW_GROUPS, _COLUMNS, _COLUMN_METADATA = 4, 1, 3
+"""Fields of FileMetaData, of a RowGroup, and of a ColumnChunk."""
+_PATH, _VALUES, _PACKED, _DATA_PAGE, _DICTIONARY_POSITION = 3, 5, 7, 9, 11
+"""Fields of ColumnMetaData: its names, its number of values, its size in the file, and positions of pages."""
 _KINDS = {0: (5, 2), _DICTIONARY_PAGE: (7, 2), 3: (8, 4)}
 """By kind of page (data, dictionary, data of version 2): the field of its own header, and the field in it with the
 encoding; field 1 is the number of values."""
@@ -76,9 +81,57 @@ def parquet_group_bytes(file: Any, source: Path | IO[bytes], columns: Sequence[s
             problem = f"expected one number or text in each row, got {'long values' if is_wide else 'lists'}"
             raise InputError(f"{where}: {leaf.path}", problem, _PLAIN_HINT)
     with source.open("rb") if isinstance(source, Path) else nullcontext(source) as content:
+        groups = read_parquet_groups(content)
         pages = _PageReader(content, where)
-        groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
-        return [sum(pages.column_bytes(group.column(index)) for index in leaves) for group in groups]
+        return [sum(pages.column_bytes(group[index]) for index in leaves) for group in groups]
+
+
+@dataclass(frozen=True)
+class ColumnChunk:
+    """The pages of a column in a row group, as the footer of a Parquet file describes them.
+
+    Attributes
+    ----------
+    name
+        Name of the column, with those of the groups that it is in.
+    values
+        Number of values, also of those that are missing.
+    packed_bytes
+        Size in the file.
+    start
+        Position of the first page.
+    """
+
+    name: str
+    values: int
+    packed_bytes: int
+    start: int
+
+
+def read_parquet_groups(file: IO[bytes]) -> list[list[ColumnChunk]]:
+    """Return the columns of each row group from the footer of a Parquet file.
+
+    Arrow's own description of a column, in Python, ends the program where its statistics are inconsistent.
+
+    Raises
+    ------
+    ValueError, LookupError, TypeError, AttributeError
+        When the footer is damaged.
+    """
+    end = file.seek(0, io.SEEK_END)
+    size, magic = struct.unpack("<I4s", _read_at(file, end - 8, 8))
+    if magic != b"PAR1":
+        raise ValueError("it has no footer that can be read")
+    footer = _read_thrift_struct(io.BytesIO(_read_at(file, end - 8 - size, size)))
+    return [[_column_chunk(column[_COLUMN_METADATA]) for column in group[_COLUMNS]] for group in footer[_ROW_GROUPS]]
+
+
+def _column_chunk(metadata: dict[int, Any]) -> ColumnChunk:
+    name = ".".join(part.decode("utf-8", "replace") for part in metadata[_PATH])
+    start, dictionary = metadata[_DATA_PAGE], metadata.get(_DICTIONARY_POSITION, 0)
+    if 0 < dictionary < start:
+        start = dictionary
+    return ColumnChunk(name, metadata[_VALUES], metadata[_PACKED], start)
 
 
 def decode_texts(column: pa.Array, where: object) -> pa.Array:
@@ -163,20 +216,18 @@ class _PageReader:
     def __init__(self, file: IO[bytes], where: object) -> None:
         self._file, self._where, self._pages = file, where, 0
 
-    def column_bytes(self, chunk: Any) -> int:
+    def column_bytes(self, chunk: ColumnChunk) -> int:
         """Return how many bytes the pages of a column have after decompression."""
-        position = chunk.data_page_offset
-        if chunk.has_dictionary_page and 0 < (chunk.dictionary_page_offset or 0) < position:
-            position = chunk.dictionary_page_offset
+        position = chunk.start
         size = values = 0
-        while values < chunk.num_values:
+        while values < chunk.values:
             self._pages += 1
             _check_parts(self._pages, self._where)
             self._file.seek(position)
             header = _read_thrift_struct(self._file)
             unpacked, packed = header.get(_UNPACKED_SIZE, -1), header.get(_PACKED_SIZE, -1)
             if min(unpacked, packed) < 0:
-                raise InputError(f"{self._where}: {chunk.path_in_schema}", "a page has no size", COMPLETE_FILE)
+                raise InputError(f"{self._where}: {chunk.name}", "a page has no size", COMPLETE_FILE)
             size += unpacked
             position = self._file.tell() + packed
             if header.get(_KIND) in _KINDS:
@@ -185,14 +236,14 @@ class _PageReader:
                 values += 0 if header[_KIND] == _DICTIONARY_PAGE else max(0, header[own].get(1, 0))
         return size
 
-    def _check_encoding(self, encoding: int, chunk: Any) -> None:
+    def _check_encoding(self, encoding: int, chunk: ColumnChunk) -> None:
         if encoding not in _ENCODINGS:
             problem = f"the encoding {_REPEATING.get(encoding, encoding)} is not supported"
-            raise InputError(f"{self._where}: {chunk.path_in_schema}", problem, _PLAIN_HINT)
+            raise InputError(f"{self._where}: {chunk.name}", problem, _PLAIN_HINT)
 
 
 def _read_thrift_struct(file: IO[bytes], depth: int = 0) -> dict[int, Any]:
-    """Return the integers and structures of a structure by field; other values are skipped."""
+    """Return the integers, texts, lists and structures of a structure by field; other values are skipped."""
     if depth > _MAX_DEPTH:
         raise ValueError("it is nested too deeply")
     fields: dict[int, Any] = {}
@@ -218,11 +269,28 @@ def _read_thrift_value(file: IO[bytes], kind: int, depth: int) -> Any:
             file.seek(8, io.SEEK_CUR)
             return None
         case 8:
-            file.seek(_read_varint(file), io.SEEK_CUR)
-            return None
+            size = _read_varint(file)
+            text = file.read(size)
+            if len(text) < size:
+                raise ValueError("it ends too early")
+            return text
+        case 9 | 10:
+            return _read_thrift_list(file, depth + 1)
         case 12:
             return _read_thrift_struct(file, depth + 1)
     raise ValueError(f"a page has a field of the type {kind}")
+
+
+def _read_thrift_list(file: IO[bytes], depth: int) -> list[Any]:
+    if depth > _MAX_DEPTH:
+        raise ValueError("it is nested too deeply")
+    head = _read_byte(file)
+    kind, count = head & 15, head >> 4
+    if count == 15:
+        count = _read_varint(file)
+    if kind in (1, 2):  # truth values, a byte each
+        kind = 3
+    return [_read_thrift_value(file, kind, depth) for _ in range(count)]
 
 
 def _read_byte(file: IO[bytes]) -> int:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator
@@ -216,7 +217,7 @@ def load_mesh(path: Path, where: str) -> trimesh.Trimesh:
         _check_size(path, where, kind)
         files = (path, *referenced_files(path))
         with _quiet_trimesh(where), np.errstate(all="ignore"), unchanged_inputs(*files):
-            mesh = trimesh.load(path, force="mesh", process=False)
+            mesh = trimesh.load(path, force="mesh", process=False, resolver=_make_resolver(path))
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
             raise InputError(where, "the file has no triangles", MESH_HINT)
         limits.TRIANGLES.check(where, max(len(mesh.faces), len(mesh.vertices) / 3))
@@ -226,6 +227,25 @@ def load_mesh(path: Path, where: str) -> trimesh.Trimesh:
             if not 0 <= vertex < len(mesh.vertices):
                 raise InputError(where, f"a triangle refers to vertex {vertex} of {len(mesh.vertices)}", MESH_HINT)
     return mesh
+
+
+def _make_resolver(source: Path) -> trimesh.resolvers.Resolver:
+    """Return what opens the files that a mesh names: regular files in its folder, within the limit of a mesh.
+
+    Trimesh's own opens whatever has the name: a pipe or a device never ends.
+    """
+    from trimesh.resolvers import FilePathResolver
+
+    folder = Path(os.path.normpath(source.parent))
+
+    class Resolver(FilePathResolver):  # type: ignore[misc]
+        def get(self, name: str) -> bytes:
+            for path in _existing_files(source, (name, name.strip(), unquote(name))):
+                if Path(os.path.normpath(path)).is_relative_to(folder):
+                    return limits.read_bytes(path, limits.FILE)
+            raise FileNotFoundError(f"{name[:80]!r} is no file in the folder of the mesh")
+
+    return Resolver(str(source))
 
 
 def _check_size(path: Path, where: str, kind: str) -> None:

@@ -11,6 +11,7 @@ only the environment variables of :data:`_VARIABLES`. :mod:`egvs.core.sandbox` s
 
 from __future__ import annotations
 
+import glob
 import json
 import math
 import os
@@ -137,9 +138,11 @@ def read_blocks(
     Raises
     ------
     InputError
-        When the other process raises one, or fails, or needs more memory than
+        When a pipe or a device has the name of the file with another suffix, as parts of files have; when the other
+        process raises one, or fails, or needs more memory than
         :data:`egvs.core.limits.READER_MEMORY` or more time than :data:`egvs.core.limits.READER_TIME`.
     """
+    _check_parts(path)
     command = [sys.executable, "-P", "-m", module, os.fspath(path.resolve()), *arguments]
     seconds = limits.READER_TIME.maximum + _size_mb(path)
     with (
@@ -173,6 +176,16 @@ def read_blocks(
         raise InputError(where, f"{doing} (its reader needed too much memory)", limits.READER_MEMORY.hint)
     if code:
         raise InputError(where, f"{doing} ({messages[-1] if messages else 'its reader failed'})", COMPLETE_FILE)
+
+
+def _check_parts(path: Path) -> None:
+    """Raise an InputError for a pipe or a device that a library may open, since it is named like the file.
+
+    Opening a pipe takes no processor time, and never ends.
+    """
+    for part in path.rglob("*") if path.is_dir() else path.parent.glob(f"{glob.escape(path.stem)}*"):
+        if part.exists() and not (part.is_file() or part.is_dir()):
+            raise InputError(part, "expected a file, got a pipe or a device", f"Remove it, or move {path.name} away.")
 
 
 def _size_mb(path: Path) -> int:

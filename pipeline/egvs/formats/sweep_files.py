@@ -26,7 +26,7 @@ import numpy as np
 from egvs.core import files, limits, readers
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.core.reading import COMPLETE_FILE
+from egvs.core.reading import COMPLETE_FILE, translate_errors
 from egvs.formats import point_clouds
 from egvs.formats.recording_options import RecordingOptions
 from egvs.formats.recordings import RING_FIELDS, RecordedSweep, Recording, chosen_sweeps, ring_numbers
@@ -171,24 +171,26 @@ def _read_file(path: Path, name: str) -> list[Sweep]:
 
 
 def _read_npz(path: Path, name: str) -> Iterator[Sweep]:
-    try:
-        with path.open("rb") as file, zipfile.ZipFile(file) as archive, np.load(file, allow_pickle=False) as arrays:
-            unpacked = sum(member.file_size for member in archive.infolist())
-            limits.UNPACKED.check_bytes(name, unpacked, f"has {unpacked / limits.MB:,.0f} MB after decompression")
-            if not arrays.files:
-                raise InputError(name, "expected an array for each sweep, got none", _NPZ_HINT)
-            for key in arrays.files:
-                array = arrays[key]
-                if not isinstance(array, np.ndarray):
-                    raise InputError(f"{name}: {key}", "expected an array, got another file", _NPZ_HINT)
-                if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
-                    problem = f"expected numbers of shape (n, 3), got {array.dtype} of shape {array.shape}"
-                    raise InputError(f"{name}: {key}", problem, _NPZ_HINT)
-                limits.POINTS.check(f"{name}: {key}", len(array))
-                points = array[:, :3].astype(np.float64)
-                yield _clean_sweep(f"{name}: {key}", points, array.dtype == np.float16)
-    except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile) as error:
-        raise InputError(name, f"cannot be read as .npz ({error})", COMPLETE_FILE) from None
+    with (
+        translate_errors(name, doing="cannot be read as .npz"),
+        path.open("rb") as file,
+        zipfile.ZipFile(file) as archive,
+        np.load(file, allow_pickle=False) as arrays,
+    ):
+        unpacked = sum(member.file_size for member in archive.infolist())
+        limits.UNPACKED.check_bytes(name, unpacked, f"has {unpacked / limits.MB:,.0f} MB after decompression")
+        if not arrays.files:
+            raise InputError(name, "expected an array for each sweep, got none", _NPZ_HINT)
+        for key in arrays.files:
+            array = arrays[key]
+            if not isinstance(array, np.ndarray):
+                raise InputError(f"{name}: {key}", "expected an array, got another file", _NPZ_HINT)
+            if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
+                problem = f"expected numbers of shape (n, 3), got {array.dtype} of shape {array.shape}"
+                raise InputError(f"{name}: {key}", problem, _NPZ_HINT)
+            limits.POINTS.check(f"{name}: {key}", len(array))
+            points = array[:, :3].astype(np.float64)
+            yield _clean_sweep(f"{name}: {key}", points, array.dtype == np.float16)
 
 
 def _clean_sweep(name: str, points_m: FloatArray, is_coarse: bool = False) -> Sweep:

@@ -36,7 +36,7 @@ GIS_FORMATS = {
 }  # fmt: skip
 """Formats by the suffix of their files."""
 
-_SHAPEFILE_PARTS = (".dbf", ".prj", ".cpg", ".shx")
+_SHAPEFILE_PARTS = (".dbf", ".prj", ".cpg", ".shx", ".DBF", ".PRJ", ".CPG", ".SHX")
 _EXPORT_HINT = "Export it again, or use GeoJSON or CSV."
 _KML_FIELDS = (
     "id", "timestamp", "begin", "end", "altitudeMode", "tessellate", "extrude", "visibility", "drawOrder", "icon",
@@ -102,15 +102,18 @@ def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str
 
 
 def _check_shapefile_complete(path: Path) -> None:
-    """Raise an InputError when a file of a Shapefile is shorter than its header says: GDAL would leave out the rest.
+    """Raise an InputError when a Shapefile has no attributes, or a file is shorter than its header says.
+
+    GDAL would leave out the attributes, or the rest.
 
     Sources: ESRI Shapefile Technical Description (1998), p. 4 (.shp and .shx: length in 16-bit words, big-endian, at
     byte 24); dBASE III (.dbf: number of records at byte 4, size of the header at byte 8 and of a record at byte 10,
     little-endian).
     """
-    for suffix in (".shp", ".shx", ".dbf"):
-        part = path.with_suffix(suffix)
-        if not part.is_file():
+    parts = (path, *companion_files(path))
+    for part in parts:
+        suffix = part.suffix.lower()
+        if suffix not in (".shp", ".shx", ".dbf"):
             continue
         with open_input(part) as content:
             head = content.read(32)
@@ -127,6 +130,9 @@ def _check_shapefile_complete(path: Path) -> None:
         if size < declared:
             problem = f"the header declares {declared:,} bytes, but the file contains {size:,}"
             raise InputError(part, problem, COMPLETE_FILE)
+    if not any(part.suffix.lower() == ".dbf" for part in parts):
+        problem = "its file of attributes, such as names and heights, is missing"
+        raise InputError(path, problem, f"Add {path.stem}.dbf, which belongs to the Shapefile.")
 
 
 def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:

@@ -56,7 +56,7 @@ FOREIGN_COLUMNS = {
     **dict.fromkeys(("height", "heights", "h", "altitude", "alt", "elevation", "elev", "height_above_ground"), _Z_HINT),
     **dict.fromkeys(("sensor_height", "mount_height", "mounting_height"), _Z_HINT),
     **dict.fromkeys(("heading", "bearing", "azimuth", "compass", "facing", "orientation", "direction"), _YAW_HINT),
-    **dict.fromkeys(("tilt", "tilt_angle", "downtilt", "inclination"), _PITCH_HINT),
+    **dict.fromkeys(("tilt", "tilt_angle", "tilt_down", "down_tilt", "downtilt", "inclination"), _PITCH_HINT),
     **dict.fromkeys(("lidar", "sensor_name", "sensor_model", "sensor_type"), _SENSOR_HINT),
 }
 """Columns of other programs, without their unit, and the column to use instead, with the conversion."""

@@ -369,12 +369,15 @@ def compare_traffic(
     z_m = float(np.median(traffic_m[:, 2]))
     if inputs.world is None:
         return
-    if inputs.scenario.statics.ground and abs(z_m) > MARGIN_M and not _is_on_solids(inputs.world, traffic_m):
+    is_off = inputs.scenario.statics.ground and abs(z_m) > clearances.KERB_M + _TOUCH_M
+    if is_off and not _is_on_solids(inputs.world, traffic_m):
         side = "above" if z_m > 0 else "below"
         problem = f"vehicles drive {abs(z_m):,.1f} m {side} the ground at z = 0 (median), since no network is named"
         hint = f"Name their network in traffic.roads, so that the ground has its height, or add {-z_m:+,.1f} m to z."
-        yield Diagnostic(RULE, where, problem, hint, is_error=True)
-        return
+        is_error = abs(z_m) > MARGIN_M
+        yield Diagnostic(RULE, where, problem, hint, is_error=is_error)
+        if is_error:
+            return
     yield from compare_scene(inputs, Reference("the traffic", traffic_m))
 
 

@@ -16,7 +16,7 @@ import itertools
 import shutil
 import tempfile
 from collections.abc import Generator, Iterable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -195,7 +195,7 @@ def _read_parquet(path: Path, element: str) -> Generator[pa.RecordBatch, None, N
     with _translate_parquet_errors(path), _open_seekable(path) as source:
         with pq.ParquetFile(source) as file:
             columns = _source_columns(file.schema_arrow.names, path, element)
-            _check_rows(file.metadata, path)
+            _check_rows(file.metadata.num_rows, source, path)
             largest = max(arrow_bounds.parquet_group_bytes(file, source, list(columns.values()), path), default=0)
             problem = f"has a row group of {largest / limits.MB:,.0f} MB after decompression"
             limits.UNPACKED.check_bytes(path, largest, problem)
@@ -239,12 +239,12 @@ def fcd_metadata(path: Path) -> bytes | None:
         return values.get(b"egvs")
 
 
-def _check_rows(metadata: Any, path: Path) -> None:
+def _check_rows(rows: int, source: Path | IO[bytes], path: Path) -> None:
     """Raise an InputError if a Parquet file declares more rows than it can contain."""
-    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    packed = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
-    if metadata.num_rows > _MAX_ROWS_PER_BYTE * packed:
-        raise InputError(path, f"declares {metadata.num_rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)
+    with source.open("rb") if isinstance(source, Path) else nullcontext(source) as file:
+        packed = sum(chunk.packed_bytes for group in arrow_bounds.read_parquet_groups(file) for chunk in group)
+    if rows > _MAX_ROWS_PER_BYTE * packed:
+        raise InputError(path, f"declares {rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)
 
 
 def _read_xml(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:
@@ -364,6 +364,13 @@ class _RowBatch:
         self.columns: dict[str, Any] = {n: pc.filter(batch.column(n), has_vehicle) for n in batch.schema.names}
         self._row = _true_positions(has_vehicle) + rows_before + 1
         self._where = f"{path}: {unit}"
+        is_nameless = pc.and_not(np.isfinite(_floats(batch.column("x"))), has_vehicle)
+        for i in _true_positions(is_nameless):
+            where, hint = (
+                f"{self._where} {i + rows_before + 1}",
+                "Name each vehicle; a row without one has only a time.",
+            )
+            raise InputError(where, "expected a name with the position, got none", hint)
 
     def check_types(self) -> None:
         import pyarrow.compute as pc

@@ -41,6 +41,9 @@ _QUARTER_SIDES = 4
 Z_DATUM, GROUND_DATUM, WORLD_DATUM = "z_datum", "ground", "world"
 """The property that states where heights count from, and its values. A Shapefile cuts names after ten characters."""
 
+# edges that are compared with all others at once: bounds the memory
+_EDGES_AT_ONCE = 64
+
 # properties that must not be misspelt
 _HEIGHT_KEYS = ("height_m", "base_m", Z_DATUM)
 # properties that ``egvs new`` adds as notes
@@ -250,6 +253,7 @@ def to_polygons(
         radius_m = _metres(properties, "radius_m", where)
         if radius_m <= 0:
             raise InputError(f"{where}: radius_m", f"expected a radius above 0 m, got {radius_m:g}")
+        check_edge_pairs(shape, where, radius_m)
         cap = "flat" if "Line" in shape.geom_type else "round"
         shape = shape.buffer(radius_m, quad_segs=_QUARTER_SIDES, cap_style=cap)
 
@@ -321,6 +325,7 @@ def _repair(
     import shapely
 
     if not shapely.is_valid(shape):
+        check_edge_pairs(shape, where)
         reason = shapely.is_valid_reason(shape)
         repair = CROSSING_RINGS
         if reason.startswith("Ring Self-intersection"):
@@ -338,6 +343,35 @@ def _repair(
     if repeated:
         repaired["doubled points"] += repeated
     return shapely.orient_polygons(clean)
+
+
+def check_edge_pairs(shape: BaseGeometry, where: str, radius_m: float = 0.0) -> None:
+    """Raise an InputError when many edges of a shape are side by side.
+
+    Memory and time to repair or to widen the shape grow with the number of their crossings, of which a few kilobytes of
+    corners can have billions. Counted are pairs of edges (of points, if it has no edges) whose boxes, widened by
+    ``radius_m``, overlap.
+    """
+    import shapely
+
+    parts = shapely.get_parts(shape)
+    if "Polygon" in shape.geom_type:
+        parts = shapely.get_rings(parts)
+    points, part = shapely.get_coordinates(parts, return_index=True)
+    starts = ends = points
+    if "Point" not in shape.geom_type:
+        is_edge = part[1:] == part[:-1]
+        starts, ends = points[:-1][is_edge], points[1:][is_edge]
+    low = np.minimum(starts, ends) - radius_m
+    high = np.maximum(starts, ends) + radius_m
+    boxes = shapely.box(*low.T, *high.T)
+    tree = shapely.STRtree(boxes)
+    pairs = 0
+    for start in range(0, len(boxes), _EDGES_AT_ONCE):
+        edges, others = tree.query(boxes[start : start + _EDGES_AT_ONCE])
+        pairs += int(np.count_nonzero(others > edges + start + 1))  # neighbours touch
+        actual = f"has more than {limits.EDGE_PAIRS.maximum:,} pairs of edges side by side"
+        limits.EDGE_PAIRS.check(where, pairs, actual)
 
 
 def _barely_crosses(shape: BaseGeometry) -> bool:

@@ -29,7 +29,7 @@ from egvs.core.wording import list_first
 from egvs.formats import xml
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference
 from egvs.traffic.network import Location, parse_location
-from egvs.world.footprints import CROSSING_RINGS, Footprint, FootprintFile, to_polygons
+from egvs.world.footprints import CROSSING_RINGS, Footprint, FootprintFile, check_edge_pairs, to_polygons
 from egvs.world.geolocation import StatedLocation, network_world_frame
 from egvs.world.map_features import POLE_TYPES, TRUNK_RADIUS_M, SolidType, SolidTypes, is_underground, vertical_extent
 
@@ -208,7 +208,12 @@ class _PolygonReader:
         import shapely
         from shapely import Polygon
 
-        if np.isfinite(points).all() and shapely.make_valid(Polygon(points)).area == 0:
+        if np.isfinite(points).all():
+            outline = Polygon(points)
+            if not outline.is_valid:
+                check_edge_pairs(outline, shape.where)
+                outline = shapely.make_valid(outline)
+        if np.isfinite(points).all() and outline.area == 0:
             self._ignore("outlines that enclose nothing", shape.element.get("type", ""))
             return []
         ring = points if points[0] == points[-1] else [*points, points[0]]

@@ -107,6 +107,14 @@ def _other_member(path: Path) -> Path:
     return path
 
 
+def _bad_header(path: Path) -> Path:
+    """An array whose header is not the text of a dictionary."""
+    path = path.with_suffix(".npz")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", b"\x93NUMPY\x01\x00\x40\x00" + b"{'descr': '<f8', 'shape': (9L,".ljust(64))
+    return path
+
+
 def _bytes(suffix: str, data: bytes):
     def write_bytes(path: Path) -> Path:
         path = path.with_name(f"sweep{suffix}")
@@ -126,6 +134,7 @@ def _bytes(suffix: str, data: bytes):
         (_far, "within 10,000 m of the sensor, got 2e+154"),
         (_other_member, "notes.txt: expected an array"),
         (_bytes(".npz", b""), "cannot be read as .npz"),
+        (_bad_header, "cannot be read as .npz"),
         (_bytes(".pcd.gz", b"\x1f\x8b no gzip"), "cannot be unpacked"),
         (_bytes(".pcd.gz", gzip.compress(b"# .PCD v0.7\n")[:-6]), "cannot be unpacked"),
         (_bytes(".docx", b"words"), "unknown file format"),

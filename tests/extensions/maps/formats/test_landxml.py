@@ -83,6 +83,15 @@ def test_rejects_broken_files(case: str, tmp_path: Path) -> None:
     assert message in str(error.value) and "s.xml" in str(error.value)
 
 
+@pytest.mark.parametrize(("encoding", "blanks"), [("utf-16", 1), ("utf-8", 600)])
+def test_unknown_encoding_is_an_error(tmp_path: Path, encoding: str, blanks: int) -> None:
+    """The declaration is not where it is looked for: in UTF-16, or after many blanks."""
+    declared = f"<?xml{' ' * blanks}version='1.0' encoding='none-such'?><LandXML/>"
+    (tmp_path / "s.xml").write_bytes(declared.encode(encoding))
+    with pytest.raises(InputError, match=r"s\.xml: cannot be read \(unknown encoding: none-such\)"):
+        read_landxml(tmp_path / "s.xml")
+
+
 def test_points_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_MAX_POINTS", "3")
     with pytest.raises(InputError, match="EGVS_MAX_POINTS"):

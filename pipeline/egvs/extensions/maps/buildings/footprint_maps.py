@@ -27,6 +27,7 @@ from egvs.creation.map_parts import DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCoun
 from egvs.formats import vector_files
 from egvs.formats.georeference import WGS84, WORLD, declared_crs
 from egvs.formats.osm import parse_length_m, parse_number
+from egvs.world.footprints import check_edge_pairs
 from egvs.world.map_features import LEVEL_M
 
 HEIGHT_COLUMNS = ("height_m", "height", "measuredheight", "measured_height", "building_height", "bldg_height")
@@ -102,6 +103,7 @@ def _read_area(
         return None
     moved = shapely.transform(shape, lambda xy: context.to_world(xy, crs, where))
     if not moved.is_valid:
+        check_edge_pairs(moved, f"{where}: geometry")
         moved = shapely.make_valid(moved)
         counts.repaired += 1
     polygons = [piece for piece in geometry_pieces(moved) if piece.geom_type == "Polygon" and piece.area > 0]

@@ -21,7 +21,7 @@ import numpy as np
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.core.reading import COMPLETE_FILE
+from egvs.core.reading import COMPLETE_FILE, translate_errors
 from egvs.formats import xml
 
 ROOT = "LandXML"
@@ -82,16 +82,16 @@ def read_landxml(path: Path) -> LandXmlFile:
     parser.CharacterDataHandler = handler.text
     parser.StartDoctypeDeclHandler = handler.reject
     parser.EntityDeclHandler = handler.reject
-    try:
-        with xml.open_bounded(path) as file:
-            source: Any = xml.Utf8Reader(file, encoding) if is_decoded else file
+    with translate_errors(path), xml.open_bounded(path) as file:
+        source: Any = xml.Utf8Reader(file, encoding) if is_decoded else file
+        try:
             while chunk := source.read(_CHUNK_BYTES):
                 parser.Parse(chunk, False)
             parser.Parse(b"", True)
-    except expat.ExpatError as error:
-        raise InputError(path, f"is not well-formed XML: {error}", COMPLETE_FILE) from None
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"is not {encoding} text: byte {error.start}", COMPLETE_FILE) from None
+        except expat.ExpatError as error:
+            raise InputError(path, f"is not well-formed XML: {error}", COMPLETE_FILE) from None
+        except UnicodeDecodeError as error:
+            raise InputError(path, f"is not {encoding} text: byte {error.start}", COMPLETE_FILE) from None
     if not handler.surfaces:
         raise InputError(path, "has no triangulated surface with points and faces", _HINT)
     return LandXmlFile(tuple(handler.surfaces), handler.crs, handler.hidden_faces)
