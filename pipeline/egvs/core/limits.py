@@ -84,7 +84,7 @@ POINTS = Limit("EGVS_MAX_POINTS", 30_000_000, "points", "a point cloud")
 TRIANGLES = Limit("EGVS_MAX_TRIANGLES", 5_000_000, "triangles", "a mesh")
 HOLES = Limit("EGVS_MAX_HOLES", 5000, "holes", "one polygon: the time to triangulate it grows with their square")
 EDGE_PAIRS = Limit(
-    "EGVS_MAX_EDGE_PAIRS", 1_000_000, "pairs of edges", "one geometry that crosses itself or is widened, side by side"
+    "EGVS_MAX_EDGE_PAIRS", 100_000, "pairs of edges", "one geometry that crosses itself or is widened, side by side"
 )
 SITES = Limit("EGVS_MAX_SITES", 100_000, "candidates", "a scenario's sites")
 BEAMS = Limit("EGVS_MAX_BEAMS", 3_000_000, "beams", "one turn of a sensor")

@@ -238,7 +238,7 @@ def _make_resolver(source: Path) -> trimesh.resolvers.Resolver:
 
     folder = Path(os.path.normpath(source.parent))
 
-    class Resolver(FilePathResolver):  # type: ignore[misc]
+    class Resolver(FilePathResolver):
         def get(self, name: str) -> bytes:
             for path in _existing_files(source, (name, name.strip(), unquote(name))):
                 if Path(os.path.normpath(path)).is_relative_to(folder):
