@@ -37,8 +37,8 @@ def test_shows_the_accuracy_study_of_the_same_run(mini, tmp_path, run_egvs, monk
     best = next(row for row in rows if row["recommended"])
     section = text[text.index("What a right decision costs") :]
     section = section[: section.index("</section>")]
-    assert best["overrides"]  # it is cheaper than the scenario
-    assert f"<code>{best['overrides']}</code>" in html.unescape(section)
+    if best["overrides"]:  # the cheapest may be the scenario itself: times are measured
+        assert f"<code>{best['overrides']}</code>" in html.unescape(section)
     assert f"expected to lose {best['loss_points']:.2f} ±" in section
     assert section.count("<tr") == 1 + sum(
         row["front"] or row["recommended"] or row["kind"] == "scenario" for row in rows
