@@ -500,7 +500,7 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.xyz", "1 2 3", r"a\.xyz: unknown file format '\.xyz'. Use one of \.bin, \.csv, .*\.las, \.laz, \.pcd, \.ply"),
+        ("a.xyz", "1 2 3", r"a\.xyz: unknown file format '\.xyz'. Use one of \.bin, \.csv, .*\.laz, \.pcd, \.ply"),
         ("a", "1 2 3", r"/a: the file name has no suffix. Use one of \.bin, \.csv"),
         # PCD, header
         ("a.pcd", "", r"a\.pcd: the PCD header has no DATA line"),
