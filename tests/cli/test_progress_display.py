@@ -67,7 +67,7 @@ def long_scan(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, dict[str, 
 
     folder = tmp_path_factory.mktemp("progress")
     scenario = write_mini(folder / "mini")
-    for number, step_deg in enumerate((0.002, 0.001, 0.0005)):
+    for number, step_deg in enumerate((0.002, 0.001, 0.0005, 0.00025)):
         out = folder / f"run{number}"
         beams = f"sensors.small.azimuth_step_deg={step_deg}"
         shown = on_terminal("run", scenario, "--out", out, "--set", beams, "--set", "sensors.small.channels=16")

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.spatial import KDTree
 
 from egvs.core import polylines
 from egvs.core.errors import Diagnostic
@@ -105,6 +103,9 @@ def align(xy_m: FloatArray, roads: Network) -> Alignment | None:
     Alignment or None
         None without positions, or without lanes for cars.
     """
+    from scipy.optimize import minimize
+    from scipy.spatial import KDTree
+
     points_m, half_width_m = _centre_lines(roads)
     if not len(xy_m) or not len(points_m):
         return None
