@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 import egvs
 from egvs.artefacts.tpog import PeriodBlocks
 from egvs.core.errors import InputError
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.hardware.design import (
     MIN_GAP_DEG,
     DesignResult,
@@ -31,8 +32,9 @@ from egvs.extensions.hardware.design import (
 from egvs.extensions.hardware.design_request import ELEVATION_BOUNDS_DEG, DesignRequest
 from egvs.runs.run_context import open_folder
 from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, detection_chances
-from egvs.scoring.targets import weighted_mean
+from egvs.scoring.targets import visible_targets, weighted_mean
 from egvs.sensors.sensor import CATALOGUE, Sensor, resolve_sensor
+from egvs.stages.scene_inputs import with_losses_of_all
 from egvs.stages.site_scoring import SiteScoring
 from tests.conftest import write_mini
 
@@ -242,7 +244,9 @@ def test_scores_of_several_seeds_are_those_of_each_simulation(tmp_path: Path) ->
     assert scoring.targets is not None
     (chosen,) = result.catalogue
     scan = egvs.Scanner(context.scene).scan(chosen.pose, chosen.sensor)
-    values = TARGET_SCORES["expected_detections"](scoring.targets.visible(egvs_beams(scan)), DETECTORS)
+    losses = ReturnProbability.of(with_losses_of_all(context.scene), chosen.sensor)  # a design always has them
+    visible = visible_targets(scoring.targets.record, egvs_beams(scan), losses)
+    values = TARGET_SCORES["expected_detections"](visible, DETECTORS)
     frame = scoring.targets.record.numbers[scoring.targets.record.frame]
     simulation, number = np.divmod(frame, 20)
     assert chosen.search_score == pytest.approx(values[number < 10].mean())
@@ -250,7 +254,6 @@ def test_scores_of_several_seeds_are_those_of_each_simulation(tmp_path: Path) ->
     left_out = np.array([values[(number >= 10) & (simulation != one)].mean() for one in range(4)])
     pseudo = 4 * chosen.score - 3 * left_out
     of_traffic = ((pseudo - pseudo.mean()) ** 2).sum() / (4 * 3)
-    visible = scoring.targets.visible(egvs_beams(scan))
     cluster, pointpillars = (detection_chances(visible, (name,))[number >= 10].mean() for name in DETECTORS)
     assert chosen.score == pytest.approx((cluster + pointpillars) / 2)
     assert chosen.se == pytest.approx(math.sqrt(of_traffic + ((cluster - pointpillars) / 2) ** 2))
