@@ -1,12 +1,14 @@
 r"""Files that state the beams of a sensor: tables of beams or rings, and the makers' own files.
 
 ============================  =========================================================================================
+File                          Content
+============================  =========================================================================================
 Table of beams (CSV)          columns ``elevation_deg``, ``azimuth_deg``; one row per beam
 Table of directions (CSV)     columns ``elevation_deg``, ``azimuth_deg``, ``dwell_s``; for patterns that do not repeat
 Table of rings (CSV)          columns ``elevation_deg``, ``azimuth_offset_deg`` and, optionally, ``vertical_offset_m``;
                               one row per ring
-Hesai, angle correction       columns ``Laser id`` (or ``Channel``), ``Elevation``, ``Azimuth``; azimuths clockwise;
-(CSV)                         often a line ``EEFF,...`` before, and a checksum after
+Hesai angle correction (CSV)  columns ``Laser id`` (or ``Channel``), ``Elevation``, ``Azimuth``; azimuths clockwise;
+                              often a line ``EEFF,...`` before, and a checksum after
 RoboSense, ``angle.csv``      no header; two columns: vertical and horizontal angle; horizontal angles clockwise
 Ouster, metadata (JSON)       ``beam_altitude_angles``, ``beam_azimuth_angles`` (clockwise), columns per frame; keys of
                               firmware 1 and 2 at the top level, of later ones in ``beam_intrinsics``,
