@@ -130,7 +130,8 @@ def modules_page() -> str:
         rows += ["| module | what one finds there |", "|---|---|"]
         paths = (path for path in package.rglob("*.py") if path.parent != package or path.name != "__init__.py")
         for name, path in sorted((_module_name(path), path) for path in paths):
-            rows.append(f"| [`{name}`][] | {_first_sentence(path)} |")
+            link = f"`{name}`" if path.name == "__init__.py" else f"[`{name}`][]"  # packages have no page
+            rows.append(f"| {link} | {_first_sentence(path)} |")
         parts.append("\n".join(rows) + "\n")
     return "\n".join(parts)
 
@@ -144,8 +145,14 @@ def _first_sentence(path: Path) -> str:
     """The first paragraph of the docstring of a module, as Markdown."""
     docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     text = " ".join(docstring.partition("\n\n")[0].split())
-    text = re.sub(r":mod:`(egvs[\w.]*)`", r"[`\1`][]", text)
+    text = re.sub(r":mod:`(egvs\.[\w.]*\w)`", lambda name: _module_link(name[1]), text)
     return re.sub(r":\w+:`([^`]+)`", r"`\1`", text.replace("``", "`")).replace("|", "\\|")
+
+
+def _module_link(name: str) -> str:
+    """A reference to a module; the name alone of a package."""
+    is_package = PACKAGE.joinpath(*name.split(".")[1:]).is_dir()
+    return f"`{name}`" if is_package else f"[`{name}`][]"
 
 
 def _table(model: dict[str, Any], models: dict[str, Any], prefix: str, heading: str) -> list[str]:
