@@ -12,7 +12,7 @@ from egvs.drawing.run_figures import site_caption
 from egvs.report import ranking_text, sensor_text
 from egvs.report.sections import describe_poles_on_road
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.levels import GroupLevel, NoticedShare, found_range
+from egvs.results.levels import GroupLevel, NoticedShare, detection_range
 from egvs.results.ranking import Pole, RankedSite, Ranking, ScoreValue
 from egvs.results.sensors import SensorComparison
 from egvs.scenario.loading import load
@@ -120,16 +120,16 @@ def test_what_detectors_find_is_a_range_where_many_vehicles_are_not_cars() -> No
         GroupLevel("larger vehicles", 80, 0.2, 0.4, 0.02, noticed),
         GroupLevel("people", 20, 0.05, 0.5, 0.02, noticed),
     )
-    found = found_range([cars, larger, people])
+    found = detection_range([cars, larger, people])
     assert (found.low, found.high, found.untrained) == pytest.approx((0.675, 0.925, 0.25))
     ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
     assert ranking_text.headline(ranked, has_traffic=True, detectors=BOTH, found=found) == (
         "a is the best of 2 sites: detectors (cluster, pointpillars) should find 65 to 95 % of vehicles (models know "
         "nothing of the 25 % that are not cars); people would notice 90 ± 2 % in its sweeps"
     )
-    assert found_range([replace(larger, weight_share=1.0)]).text == "0 to 100 %"
+    assert detection_range([replace(larger, weight_share=1.0)]).text == "0 to 100 %"
     few = [replace(cars, weight_share=0.9), replace(larger, weight_share=0.1)]
-    assert found_range(few) is None and found_range(()) is None
+    assert detection_range(few) is None and detection_range(()) is None
 
 
 def test_a_pole_from_which_people_notice_clearly_more_is_named() -> None:

@@ -423,7 +423,7 @@ def stated(offset: str, projection: str = "!") -> str:
     return f'<location netOffset="{offset}" projParameter="{projection}"/>'
 
 
-def read_beside_network(folder: Path, network: str, *shapes: str, world: Georeference = NOWHERE) -> FootprintFile:
+def read_with_network(folder: Path, network: str, *shapes: str, world: Georeference = NOWHERE) -> FootprintFile:
     """Shapes beside a network with a ``<location>``."""
     (folder / "n.net.xml").write_text(f"<net>{network}</net>")
     location = read_location(folder / "n.net.xml")
@@ -454,7 +454,7 @@ def test_rejects_other_location_that_cannot_be_converted(
     """Without a projection on both sides, nobody knows whether both offsets count from the same origin."""
     elements = [poly("building"), file] if is_last else [file, poly("building")]
     with pytest.raises(InputError) as error:
-        read_beside_network(tmp_path, network, *elements)
+        read_with_network(tmp_path, network, *elements)
     assert error.value.where == str(tmp_path / "s.poly.xml")
     assert error.value.problem == f"its <location> states {statements}"
     assert error.value.hint.startswith("Make the file with polyconvert and the scenario's network (-n).")
@@ -462,13 +462,13 @@ def test_rejects_other_location_that_cannot_be_converted(
 
 def test_rejects_points_of_other_location(tmp_path: Path) -> None:
     lamp = '<poi id="a" type="highway.street_lamp" x="2" y="2"/>'
-    assert len(read_beside_network(tmp_path, stated("0,0"), stated("0,0"), lamp).footprints) == 1
+    assert len(read_with_network(tmp_path, stated("0,0"), stated("0,0"), lamp).footprints) == 1
     with pytest.raises(InputError, match="states netOffset 30,0"):
-        read_beside_network(tmp_path, stated("0,0"), stated("30,0"), lamp)
+        read_with_network(tmp_path, stated("0,0"), stated("30,0"), lamp)
 
 
 def test_accepts_same_location_in_other_notation(tmp_path: Path) -> None:
-    file = read_beside_network(tmp_path, stated("0.00,-0.001", ""), stated("0,0"), poly("building"))
+    file = read_with_network(tmp_path, stated("0.00,-0.001", ""), stated("0,0"), poly("building"))
     assert file.footprints[0].polygon.bounds == (0, 0, 4, 4)
     assert not file.repaired["shapes in metres of its own <location>, brought into the world frame"]
 
@@ -476,7 +476,7 @@ def test_accepts_same_location_in_other_notation(tmp_path: Path) -> None:
 def test_counts_shapes_that_are_converted(tmp_path: Path) -> None:
     here = Georeference(FRAME, HERE, "scenario.toml")
     moved = stated("-550690.00,-5635195.00", UTM)
-    file = read_beside_network(
+    file = read_with_network(
         tmp_path, stated("-550700.00,-5635200.00", UTM), moved, poly("building", "10,5 14,5 14,9 10,9"), world=here
     )
     assert file.footprints[0].polygon.bounds == (0, 0, 4, 4)

@@ -28,7 +28,7 @@ from egvs.report import ranking_text, reliability, sections
 from egvs.report.extension_sections import read_sections
 from egvs.report.sensor_text import has_losses, range_note, upper_limit_note
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
-from egvs.results.levels import FoundRange, found_range, read_levels
+from egvs.results.levels import DetectionRange, detection_range, read_levels
 from egvs.results.ranking import Pole, RankedSite, Ranking
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import NOTICED
@@ -111,7 +111,7 @@ def _print_ranking(
 ) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
     hint = ranking_text.recorded_frames_hint(scenario, ranked, record.stages)
-    found = found_range(read_levels(RunFolder(folder).levels, ranked.sites[0].site))
+    found = detection_range(read_levels(RunFolder(folder).levels, ranked.sites[0].site))
     print_sentences([verdict(ranked, hint, scenario.score.ranking_detectors, found)])
     for part in read_sections(RunFolder(folder), scenario, record.stages):
         for warning in part.warnings:
@@ -138,7 +138,7 @@ def _print_ranking(
         print_sentences([preference])
 
 
-def verdict(ranked: Ranking, hint: str = "", detectors: Sequence[str] = (), found: FoundRange | None = None) -> str:
+def verdict(ranked: Ranking, hint: str = "", detectors: Sequence[str] = (), found: DetectionRange | None = None) -> str:
     """Return a few sentences: the best site, how clearly it leads and, if unclear, the ``hint`` on what helps.
 
     ``detectors`` are those of the score that ranks; ``found`` as for :func:`egvs.report.ranking_text.level`.

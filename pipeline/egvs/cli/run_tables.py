@@ -199,7 +199,7 @@ def levels_table(site: str, levels: Sequence[GroupLevel]) -> Table:
     columns: list[Column[GroupLevel]] = [
         Column(f"from {site}", lambda level: level.road_users, "left"),
         Column("observations", lambda level: f"{level.observations:,}"),
-        Column(SCORE_LABELS[DEFAULT_SCORE].head, lambda level: level.found_text),
+        Column(SCORE_LABELS[DEFAULT_SCORE].head, lambda level: level.detection_text),
         Column(SCORE_LABELS[NOTICED].head, lambda level: level.noticed.text),
     ]
     return make_table(columns, levels, caption=GROUPS_NOTE)

@@ -233,7 +233,7 @@ class Digests:
     def _is_unchanged(self, name: str) -> bool:
         """Whether a file is the one that was hashed, and has been all the time.
 
-        A new link to a file changes nothing but its ctime; then, and where the stamp is too young, the file is hashed.
+        A new link to a file changes its ctime only; then, and where the stamp is too young, the file is hashed.
         """
         digest, entry, stamp = self._digests[name], self.entries.get(name), _file_stamp(name)
         if self._is_trusted(name, stamp, digest):

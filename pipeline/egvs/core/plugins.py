@@ -123,7 +123,7 @@ def load_plugins(group: str, kind: type[T], expected: str) -> tuple[T, ...]:
     Raises
     ------
     MissingBackendError
-        When one cannot be loaded, or is none of this kind.
+        When one cannot be loaded, or is of another kind.
     """
     loaded = []
     for name in plugin_names(group):
@@ -135,7 +135,7 @@ def load_plugins(group: str, kind: type[T], expected: str) -> tuple[T, ...]:
 
 
 def load_rows(group: str, name: str, kind: type[T]) -> tuple[T, ...]:
-    """Return the object of an entry point that is a tuple of rows of one class; MissingBackendError if it is none."""
+    """Return the object of an entry point that is a tuple of rows of one class; MissingBackendError if it is not."""
     rows = load_plugin(group, name)
     if not isinstance(rows, tuple) or not all(isinstance(row, kind) for row in rows):
         raise plugin_error(group, name, f"expected a tuple of {kind.__module__}.{kind.__name__}, got {rows!r}")

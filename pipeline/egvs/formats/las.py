@@ -89,7 +89,7 @@ def _check_file(path: Path, where: str) -> int:
 
 
 def _first_record_after_points(header: laspy.LasHeader) -> int:
-    """Return where the first record after the points starts; 0 if there is none."""
+    """Return where the first record after the points starts; 0 without such a record."""
     starts = []
     if header.number_of_evlrs:
         starts.append(int(header.start_of_first_evlr))

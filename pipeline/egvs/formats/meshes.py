@@ -170,7 +170,7 @@ SCENE_NODE = "egvs_world_z_up"
 
 
 def is_exported_scene(path: Path) -> bool:
-    """Return whether a file is a scene that ``egvs export --to glb`` wrote; a damaged file is none."""
+    """Return whether a file is a scene that ``egvs export --to glb`` wrote; False for a damaged file."""
     if path.suffix.lower() not in (".gltf", ".glb"):
         return False
     try:

@@ -1,4 +1,4 @@
-"""Read a file in another process, which may do nothing but read it, within limits of memory and time.
+"""Read a file in another process that may only read it, within limits of memory and time.
 
 Libraries in C++ and Rust allocate as much memory as a damaged file asks for, print to the terminal, open whatever a
 file names, and may end their process. Here they do so in a process of their own, which runs a module of this package as

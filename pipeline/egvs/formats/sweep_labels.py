@@ -141,7 +141,7 @@ def read_labels(paths: Sequence[str | Path], options: LabelOptions | None = None
     Raises
     ------
     InputError
-        If a file is missing, damaged, of an unknown format, or has no possible boxes; if there are none at all.
+        If a file is missing, damaged, of an unknown format, or has no possible boxes; if no file has a box.
     """
     labels: list[SweepLabels] = []
     for path in list_files(paths, KIND):

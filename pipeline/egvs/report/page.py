@@ -57,7 +57,7 @@ from egvs.report.sections import (
 from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, has_losses, range_note
 from egvs.results import labels as formatting
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.levels import GROUPS_NOTE, GroupLevel, found_range, read_levels
+from egvs.results.levels import GROUPS_NOTE, GroupLevel, detection_range, read_levels
 from egvs.results.map_credits import read_map_credits
 from egvs.results.ranking import RankedSite, Ranking, share_of_limit
 from egvs.results.sensors import SensorComparison
@@ -316,7 +316,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
 
 
 def _read_plan(folder: RunFolder, stages: Mapping[str, StageRecord]) -> SensorPlan | None:
-    """Return the plan in a run folder; None where there is none, or it does not belong to the run."""
+    """Return the plan in a run folder; None without a plan, or if it belongs to another run."""
     if not folder.placement.is_file():
         return None
 
@@ -505,7 +505,7 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     setting = egvs_setting(scenario.gamma, tpog.grid.voxel_m, moving_occlusion=has_occlusion)
     return {
         "headline": headline(
-            ranking, bool(tpog.counts.any()), scenario.score.ranking_detectors, found_range(contents.levels)
+            ranking, bool(tpog.counts.any()), scenario.score.ranking_detectors, detection_range(contents.levels)
         ),
         "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.wording import by_number, format_percent, list_first
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability, join_names
-from egvs.results.levels import MIN_NOTICED_LEAD, FoundRange
+from egvs.results.levels import MIN_NOTICED_LEAD, DetectionRange
 from egvs.results.ranking import CLOSE_SHARE, RankedSite, Ranking
 from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
@@ -40,7 +40,7 @@ FROM_SENSOR_NOTE = (
 )
 
 
-def level(site: RankedSite, detectors: Sequence[str], found: FoundRange | None = None) -> str:
+def level(site: RankedSite, detectors: Sequence[str], found: DetectionRange | None = None) -> str:
     """Return what a site achieves: what detectors should find and, beside it, what people would notice.
 
     Parameters
@@ -89,7 +89,7 @@ def noticed_preference(ranking: Ranking) -> str:
 
 
 def headline(
-    ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = (), found: FoundRange | None = None
+    ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = (), found: DetectionRange | None = None
 ) -> str:
     """Return the result in one sentence; ``detectors`` and ``found`` as for :func:`level`."""
     best, count = ranking.best, len(ranking.sites)

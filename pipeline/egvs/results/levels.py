@@ -114,14 +114,14 @@ class GroupLevel:
     noticed: NoticedShare
 
     @property
-    def found_text(self) -> str:
+    def detection_text(self) -> str:
         """The share that detectors should find, with its error."""
         return SCORE_LABELS[DEFAULT_SCORE].with_error(self.found, math.nan if self.found_se is None else self.found_se)
 
 
 @dataclass(frozen=True)
-class FoundRange:
-    """The range of the share that detectors find, where nothing is known of many vehicles; see :func:`found_range`.
+class DetectionRange:
+    """The range of the share that detectors find, where nothing is known of many vehicles; see :func:`detection_range`.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class FoundRange:
         return format_range(self.low, self.high)
 
 
-def found_range(levels: Sequence[GroupLevel]) -> FoundRange | None:
+def detection_range(levels: Sequence[GroupLevel]) -> DetectionRange | None:
     """Return the range of the share that detectors find from a site, where a number would not be supported.
 
     Parameters
@@ -151,7 +151,7 @@ def found_range(levels: Sequence[GroupLevel]) -> FoundRange | None:
 
     Returns
     -------
-    FoundRange or None
+    DetectionRange or None
         None if at most :data:`MAX_SHARE_OUTSIDE` of the vehicles are not of :data:`TRAINED_GROUP`, or if the groups are
         unknown.
     """
@@ -159,7 +159,7 @@ def found_range(levels: Sequence[GroupLevel]) -> FoundRange | None:
     if not untrained > MAX_SHARE_OUTSIDE:
         return None
     low = math.fsum(level.weight_share * level.found for level in levels if level.road_users == TRAINED_GROUP)
-    return FoundRange(low, low + untrained, untrained)
+    return DetectionRange(low, low + untrained, untrained)
 
 
 GROUPS_NOTE = (

@@ -4,7 +4,7 @@ Steps: look up the type of each shape in the tables of solid types (:mod:`egvs.w
 walls and barriers; cut out courtyards, which polyconvert writes as polygons of type ``inner``. Heights are those of the
 shape (attribute or parameter ``height``, or tags that ``polyconvert --all-attributes`` keeps), else of its type.
 
-A shape is in metres of the file's own ``<location>``, or of the world frame if there is none. With ``geo``, it is in
+A shape is in metres of the file's own ``<location>``, or of the world frame without it. With ``geo``, it is in
 degrees, as are points with ``lon`` and ``lat``. Metres of another ``<location>`` than that of the network are converted
 through longitude and latitude, and counted; without a known projection on both sides they are an error.
 """

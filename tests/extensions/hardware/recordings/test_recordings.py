@@ -134,7 +134,7 @@ def test_decodes_any_layout_of_points(order: str) -> None:
 
 
 def test_blocks_carry_times_and_rings() -> None:
-    """Either without the other; times that are none are not taken for some."""
+    """Either without the other; invalid times are not taken for times."""
     points, values = np.ones((4, 3)), np.array([0.0, 0.02, 0.05, 0.1])
     for time_s, ring in ((values, values * 10), (values, None), (None, np.arange(4.0)), (None, None)):
         blocks = list(sweep_blocks("one", points, time_s, ring))
