@@ -15,6 +15,7 @@ SYSTEM = (
     "tests/extensions/tracks/new/",
     "tests/extensions/tracks/test_recorded_tracks",
     "tests/extensions/validation/test_held_out_departures",
+    "tests/formats/test_osm",
     "tests/runs/",
     "tests/studies/",
     "tests/traffic/",

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
+from egvs.core.polygons import check_edge_pairs
 from egvs.formats import xml
 from egvs.scenario.fields import parse_coordinate_m
 from egvs.traffic.signal_clock import SignalClock
@@ -54,6 +55,8 @@ ROAD_VCLASSES = (
 _PEDESTRIAN = "pedestrian"
 _OSM_SUFFIXES = (".osm", ".osm.xml", ".osm.pbf")
 _HINT = "Use a network that netconvert wrote."
+# pairs of their edges are far below any limit
+_FEW_POINTS = 200
 
 
 @dataclass(frozen=True)
@@ -94,9 +97,20 @@ class Shape:
         """Points in metres, shape (n, 3), float64; z is 0 where the file has none."""
         try:
             points = [[*map(parse_coordinate_m, point.split(",")), 0.0][:3] for point in self.text.split()]
-            return np.array(points, dtype=np.float64).reshape(-1, 3)
+            shape_m = np.array(points, dtype=np.float64).reshape(-1, 3)
         except ValueError as error:
             raise InputError(self.where, f"invalid coordinates in a shape ({error})", _HINT) from None
+        if len(shape_m) > _FEW_POINTS:
+            self._check_edges(shape_m)
+        return shape_m
+
+    def _check_edges(self, shape_m: NDArray[np.float64]) -> None:
+        """Raise an InputError when it would take long to repair the outline."""
+        import shapely
+
+        outline = shapely.Polygon(shape_m[:, :2])
+        if not outline.is_valid:
+            check_edge_pairs(outline, self.where)
 
     @property
     def has_heights(self) -> bool:
@@ -122,6 +136,14 @@ class Lane(Shape):
     def is_sidewalk(self) -> bool:
         """Whether pedestrians may use it, and cars may not."""
         return self.permission.admits(_PEDESTRIAN) and not self.permission.admits(CAR)
+
+    def _check_edges(self, shape_m: NDArray[np.float64]) -> None:
+        """Raise an InputError when it would take long to widen the line, or to repair the outline."""
+        import shapely
+
+        super()._check_edges(shape_m)
+        width_m = LANE_WIDTH_M if self.width_m is None else self.width_m
+        check_edge_pairs(shapely.LineString(shape_m[:, :2]), self.where, width_m / 2.0)
 
     def area(self, last_m: float | None = None, *, margin_m: float = 0.0) -> Polygon:
         """Return the area of a lane with a centre line of at least two points, with flat ends.

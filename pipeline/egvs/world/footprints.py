@@ -21,6 +21,7 @@ import numpy as np
 
 from egvs.core import limits
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, find_misspelling
+from egvs.core.polygons import check_edge_pairs, repair_polygon
 from egvs.core.reading import read_json
 from egvs.core.wording import number_of
 from egvs.formats import vector_files
@@ -40,9 +41,6 @@ _QUARTER_SIDES = 4
 
 Z_DATUM, GROUND_DATUM, WORLD_DATUM = "z_datum", "ground", "world"
 """The property that states where heights count from, and its values. A Shapefile cuts names after ten characters."""
-
-# edges that are compared with all others at once: bounds the memory
-_EDGES_AT_ONCE = 64
 
 # properties that must not be misspelt
 _HEIGHT_KEYS = ("height_m", "base_m", Z_DATUM)
@@ -325,18 +323,18 @@ def _repair(
     import shapely
 
     if not shapely.is_valid(shape):
-        check_edge_pairs(shape, where)
+        valid = repair_polygon(shape, where)
         reason = shapely.is_valid_reason(shape)
         repair = CROSSING_RINGS
         if reason.startswith("Ring Self-intersection"):
             repair = "rings that touched themselves"
-        elif may_be_rounded and _barely_crosses(shape):
+        elif may_be_rounded and _barely_crosses(shape, valid):
             repair = "rings that rounded degrees made cross"
         elif not keep_crossing_parts:
             raise InputError(
                 where, f"is not a valid polygon ({reason})", "Use rings that do not cross, with holes inside."
             )
-        shape = shapely.make_valid(shape)
+        shape = valid
         repaired[repair] += 1
     clean = shapely.remove_repeated_points(shape)
     repeated = len(shapely.get_coordinates(shape)) - len(shapely.get_coordinates(clean))
@@ -345,38 +343,6 @@ def _repair(
     return shapely.orient_polygons(clean)
 
 
-def check_edge_pairs(shape: BaseGeometry, where: str, radius_m: float = 0.0) -> None:
-    """Raise an InputError when many edges of a shape are side by side.
-
-    Memory and time to repair or to widen the shape grow with the number of their crossings, of which a few kilobytes of
-    corners can have billions. Counted are pairs of edges (of points, if it has no edges) whose boxes, widened by
-    ``radius_m``, overlap.
-    """
-    import shapely
-
-    parts = shapely.get_parts(shape)
-    if "Polygon" in shape.geom_type:
-        parts = shapely.get_rings(parts)
-    points, part = shapely.get_coordinates(parts, return_index=True)
-    starts = ends = points
-    if "Point" not in shape.geom_type:
-        is_edge = part[1:] == part[:-1]
-        starts, ends = points[:-1][is_edge], points[1:][is_edge]
-    low = np.minimum(starts, ends) - radius_m
-    high = np.maximum(starts, ends) + radius_m
-    boxes = shapely.box(*low.T, *high.T)
-    tree = shapely.STRtree(boxes)
-    pairs = 0
-    for start in range(0, len(boxes), _EDGES_AT_ONCE):
-        edges, others = tree.query(boxes[start : start + _EDGES_AT_ONCE])
-        pairs += int(np.count_nonzero(others > edges + start + 1))  # neighbours touch
-        actual = f"has more than {limits.EDGE_PAIRS.maximum:,} pairs of edges side by side"
-        limits.EDGE_PAIRS.check(where, pairs, actual)
-
-
-def _barely_crosses(shape: BaseGeometry) -> bool:
-    """Return whether the parts that crossing rings turn over are negligible slivers."""
-    import shapely
-
-    valid_m2 = shapely.make_valid(shape).area
-    return bool(abs(valid_m2 - shape.area) <= _MAX_SLIVER_SHARE * valid_m2)
+def _barely_crosses(shape: BaseGeometry, valid: BaseGeometry) -> bool:
+    """Return whether the parts that crossing rings turn over, seen in their repair, are negligible slivers."""
+    return bool(abs(valid.area - shape.area) <= _MAX_SLIVER_SHARE * valid.area)

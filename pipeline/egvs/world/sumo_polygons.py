@@ -25,11 +25,12 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.numbers import number_or_nan
+from egvs.core.polygons import repair_polygon
 from egvs.core.wording import list_first
 from egvs.formats import xml
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference
 from egvs.traffic.network import Location, parse_location
-from egvs.world.footprints import CROSSING_RINGS, Footprint, FootprintFile, check_edge_pairs, to_polygons
+from egvs.world.footprints import CROSSING_RINGS, Footprint, FootprintFile, to_polygons
 from egvs.world.geolocation import StatedLocation, network_world_frame
 from egvs.world.map_features import POLE_TYPES, TRUNK_RADIUS_M, SolidType, SolidTypes, is_underground, vertical_extent
 
@@ -205,14 +206,11 @@ class _PolygonReader:
 
     def _areas(self, shape: _Shape, points: Points) -> list[Polygon]:
         """Return what an outline encloses: each part where it crosses itself, nothing where it is flat."""
-        import shapely
         from shapely import Polygon
 
         if np.isfinite(points).all():
             outline = Polygon(points)
-            if not outline.is_valid:
-                check_edge_pairs(outline, shape.where)
-                outline = shapely.make_valid(outline)
+            outline = repair_polygon(outline, shape.where)
         if np.isfinite(points).all() and outline.area == 0:
             self._ignore("outlines that enclose nothing", shape.element.get("type", ""))
             return []

@@ -27,6 +27,7 @@ from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY
+from egvs.core.polygons import check_crossings, repair_polygon
 from egvs.creation.carriageway import clear_of_carriageway, geometry_pieces, lanes_under, large_pieces
 from egvs.creation.junctions import Streets
 from egvs.creation.map_parts import DECK_BASE_M, DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedSolid
@@ -143,7 +144,9 @@ def way_lines(way: Way, xy: dict[int, XY]) -> list[LineString]:
             continue
         points = [xy[node] for node in nodes]
         if len(points) > 1:
-            lines += large_pieces(LineString(points))[0]
+            line = LineString(points)
+            check_crossings([line], f"way {way.id}")
+            lines += large_pieces(line)[0]
     return lines
 
 
@@ -152,7 +155,8 @@ def way_area(way: Way, xy: dict[int, XY], counts: ImportCounts) -> BaseGeometry:
     polygon = Polygon([xy[node] for node in way.nodes])
     if polygon.is_valid:
         return polygon
-    areas = [piece for piece in geometry_pieces(shapely.make_valid(polygon)) if isinstance(piece, Polygon)]
+    repaired = repair_polygon(polygon, f"way {way.id}")
+    areas = [piece for piece in geometry_pieces(repaired) if isinstance(piece, Polygon)]
     if areas:
         counts.repaired += 1
     return shapely.union_all(areas)
@@ -182,6 +186,7 @@ def find_buildings(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts)
         if _is_outline(tags):
             parts = [part_areas[i] for i in parts_tree.query(area, predicate="intersects")]
         if parts:
+            check_crossings([area, *parts], name)
             area = area.difference(shapely.union_all(parts))
         pieces, slivers = large_pieces(area)
         counts.slivers += slivers
@@ -239,6 +244,9 @@ def _footprints(
         if map_features.is_underground(tags):
             counts.drop("building", "underground")
             continue
+        ways = [extract.ways[way_id] for way_id in relation.ways("outer", "", "inner") if way_id in extract.ways]
+        lines = [LineString([xy[node] for node in way.nodes if node in xy]) for way in ways if len(way.nodes) > 1]
+        check_crossings(lines, f"relation {relation.id}")
         outer = _assemble_area(relation.ways("outer", ""), extract, xy, counts)
         inner = _assemble_area(relation.ways("inner"), extract, xy, counts)
         if outer is None or inner is None:

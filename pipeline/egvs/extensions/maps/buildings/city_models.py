@@ -24,6 +24,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.polygons import check_crossings, repair_polygon
 from egvs.core.wording import by_number, list_first, number_of
 from egvs.creation.carriageway import geometry_pieces
 from egvs.creation.map_parts import (
@@ -180,9 +181,9 @@ class _Collector:
             return
         rings_m = _to_world(placed, self.context, where)
         if is_footprint:
-            self._add_footprint(city_object, kind, rings_m)
+            self._add_footprint(city_object, kind, rings_m, where)
         else:
-            self._add_mesh(city_object, kind, rings_m)
+            self._add_mesh(city_object, kind, rings_m, where)
 
     def _place(self, placement: Placement, file: CityModelFile, system: ReferenceSystem, where: str) -> Rings:
         """Return the surfaces of a template where it is placed."""
@@ -203,7 +204,7 @@ class _Collector:
         self.triangles += triangles
         limits.TRIANGLES.check(where, self.triangles, "makes too many triangles with the objects before it")
 
-    def _add_mesh(self, city_object: CityObject, kind: str, rings_m: Rings) -> None:
+    def _add_mesh(self, city_object: CityObject, kind: str, rings_m: Rings, where: str) -> None:
         mesh = triangulate_surfaces(rings_m)
         self._check_size(len(mesh.faces), city_object.name)
         self.repairs["degenerate"] += mesh.degenerate_rings
@@ -212,7 +213,7 @@ class _Collector:
             self.counts.drop(kind, "degenerate")
             return
         if city_object.kind == "PlantCover" and city_object.measured_height_m() and _is_flat(mesh):
-            self._add_footprint(city_object, kind, rings_m)
+            self._add_footprint(city_object, kind, rings_m, where)
             return
         mapped = self._with_unique_name(MappedMesh(city_object.name, kind, mesh.vertices_m, mesh.faces, mesh.is_closed))
         if mapped is None:
@@ -235,14 +236,14 @@ class _Collector:
             name = f"{mesh.name}#{number}"
         return MappedMesh(name, mesh.kind, mesh.vertices_m, mesh.faces, mesh.is_closed)
 
-    def _add_footprint(self, city_object: CityObject, kind: str, rings_m: Rings) -> None:
+    def _add_footprint(self, city_object: CityObject, kind: str, rings_m: Rings, where: str) -> None:
         height_m, source = city_object.measured_height_m(), "height"
         if height_m is None and city_object.storeys() is not None:
             height_m, source = LEVEL_M * (city_object.storeys() or 0.0), "levels"
         if height_m is None and kind != "building":
             self.counts.drop(kind, "no_height")
             return
-        area = _footprint(rings_m)
+        area = _footprint(rings_m, where)
         if area.is_empty:
             self.counts.drop(kind, "degenerate")
             return
@@ -377,13 +378,15 @@ def _check_coordinates(points: FloatArray, where: str) -> None:
         raise InputError(where, problem, "Check the file's coordinates and its reference system.")
 
 
-def _footprint(rings_m: Sequence[Sequence[FloatArray]]) -> BaseGeometry:
+def _footprint(rings_m: Sequence[Sequence[FloatArray]], where: str) -> BaseGeometry:
     """Return the area under surfaces, seen from above; empty if they have none."""
     areas = []
     for surface in rings_m:
         outer, *holes = [ring[:, :2] for ring in surface]
         if len(outer) > 2:
-            areas.append(shapely.make_valid(shapely.Polygon(outer, [hole for hole in holes if len(hole) > 2])))
+            surface_m = shapely.Polygon(outer, [hole for hole in holes if len(hole) > 2])
+            areas.append(repair_polygon(surface_m, where))
+    check_crossings(areas, where)
     area = shapely.union_all(areas)
     polygons = [piece for piece in geometry_pieces(area) if piece.geom_type == "Polygon"]
     return polygons[0] if len(polygons) == 1 else shapely.MultiPolygon(polygons)

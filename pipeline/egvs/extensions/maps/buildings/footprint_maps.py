@@ -21,13 +21,13 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
+from egvs.core.polygons import repair_polygon
 from egvs.core.reading import read_json, translate_errors
 from egvs.creation.carriageway import geometry_pieces
 from egvs.creation.map_parts import DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MapContext, MappedSolid, SolidMap
 from egvs.formats import vector_files
 from egvs.formats.georeference import WGS84, WORLD, declared_crs
 from egvs.formats.osm import parse_length_m, parse_number
-from egvs.world.footprints import check_edge_pairs
 from egvs.world.map_features import LEVEL_M
 
 HEIGHT_COLUMNS = ("height_m", "height", "measuredheight", "measured_height", "building_height", "bldg_height")
@@ -102,10 +102,8 @@ def _read_area(
         counts.drop("building", "no_outline")
         return None
     moved = shapely.transform(shape, lambda xy: context.to_world(xy, crs, where))
-    if not moved.is_valid:
-        check_edge_pairs(moved, f"{where}: geometry")
-        moved = shapely.make_valid(moved)
-        counts.repaired += 1
+    counts.repaired += not moved.is_valid
+    moved = repair_polygon(moved, f"{where}: geometry")
     polygons = [piece for piece in geometry_pieces(moved) if piece.geom_type == "Polygon" and piece.area > 0]
     if not polygons:
         counts.drop("building", "degenerate")

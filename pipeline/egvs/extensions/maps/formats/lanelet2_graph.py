@@ -21,12 +21,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import shapely
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core import polylines
 from egvs.core.grid import FloatArray
+from egvs.core.polygons import repair_polygon
 from egvs.extensions.maps.formats.lanelet2 import Lanelet, LaneletMap
 from egvs.formats.osm import Tags
 
@@ -125,7 +125,7 @@ class DirectedLanelet:
     def area(self) -> BaseGeometry:
         """The ground between the bounds."""
         ring = np.vstack([self.left_m[:, :2], self.right_m[::-1, :2]])
-        return shapely.make_valid(Polygon(ring))
+        return repair_polygon(Polygon(ring), f"lanelet {self.key}")
 
     @property
     def length_m(self) -> float:
