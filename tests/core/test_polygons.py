@@ -72,10 +72,6 @@ def test_keeps_valid_polygon_and_empties_flat_one() -> None:
     assert repair_polygon(shapely.Polygon([(0, 0), (1, 1), (2, 2)]), "a").is_empty
 
 
-def test_many_touching_houses_are_repaired() -> None:
-    assert repair_polygon(houses(20, 20), "a").area == pytest.approx(400)
-
-
 def lines_of(*shapes: shapely.Polygon) -> list[BaseGeometry]:
     return [shape.exterior for shape in shapes]
 
@@ -88,7 +84,7 @@ def lines_of(*shapes: shapely.Polygon) -> list[BaseGeometry]:
         lambda: check_edge_pairs(shapely.LineString([(i * 0.1, i % 2 * 50) for i in range(9000)]), "a.json", 1.6),
         lambda: check_edge_pairs(shapely.MultiPoint(np.zeros((900, 2))), "a.json", 1.0),
         lambda: check_crossings(
-            lines_of(comb(400), shapely.transform(comb(400), lambda xy: xy[:, ::-1] * 8)), "a.json"
+            lines_of(comb(400), shapely.transform(comb(400), lambda xy: xy[:, ::-1] * (8, 0.125))), "a.json"
         ),
     ],
     ids=["random corners", "star", "zigzag", "points", "crossed combs"],

@@ -181,6 +181,14 @@ def polygon(holes: int) -> str:
 
 
 OSM = '<osm version="0.6"><node id="1" lat="1" lon="2" version="1"/><node id="2" lat="1" lon="2" version="1"/></osm>'
+
+
+def osm_tag(mb: float) -> str:
+    """The end of a map, with many ways."""
+    tags = "".join(f'<tag k="{key}" v="{"x" * 200}"/>' for key in range(5))
+    return "".join(f'<way id="{way}" version="1">{tags}</way>' for way in range(1, 1 + int(mb * 1000))) + "</osm>"
+
+
 GRID = "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2\n3 4\n"
 BOX = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
 CONFINED = {"EGVS_MAX_FILE_MB": 1, "EGVS_MAX_READER_MB": 20}
@@ -221,7 +229,10 @@ TRIALS = {
         "a.feather", write_feather, read_feather,
         {"EGVS_MAX_FILE_MB": 1, "EGVS_MAX_ROWS": 1, "EGVS_MAX_UNPACKED_MB": 1},
     ),
-    "OpenStreetMap (XML, PBF)": Trial("a.osm", text(OSM), osm.read_osm, {"EGVS_MAX_MAP_OBJECTS": 1}),
+    "OpenStreetMap (XML, PBF)": Trial(
+        "a.osm", lambda path, mb: path.write_text(OSM.replace("</osm>", osm_tag(mb))),  # type: ignore[arg-type,return-value]
+        osm.read_osm, {"EGVS_MAX_MAP_OBJECTS": 1, "EGVS_MAX_UNPACKED_MB": 1, "EGVS_MAX_READER_MB": 20},
+    ),
     "points in CSV, PLY, PCD": Trial(
         "a.csv", text("x_m,y_m,z_m\n1,2,3\n2,3,4\n"), read_points, {"EGVS_MAX_FILE_MB": 1, "EGVS_MAX_POINTS": 1}
     ),

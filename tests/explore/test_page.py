@@ -11,6 +11,7 @@ import urllib.error
 import urllib.request
 import weakref
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from tests.conftest import write_mini
 
 viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
 
+import msgspec  # noqa: E402 - comes with viser
 import websockets  # noqa: E402 - comes with viser
 from websockets.sync.client import connect  # noqa: E402
 
@@ -84,6 +86,50 @@ def test_refuses_page_and_connection_without_key(page: Page) -> None:
         f"ws://{HOST}:{port}", additional_headers=cookie, origin=page.origin, subprotocols=protocol
     ) as connection:
         assert connection.recv(10)
+
+
+GARBAGE = [
+    b"\x00\xff" * 50 + b"\r\n\r\n",
+    b"GET / HTTP/9.9\r\n\r\n",
+    b"GET /\xff HTTP/1.1\r\nHost: \xff\r\n\r\n",
+    b"GE",
+]
+MESSAGES = [
+    "text",
+    b"\xc1",
+    b"\x80",
+    msgspec.msgpack.encode({"type": "no such message"}),
+    msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": [5], "updates": 7}),
+    msgspec.msgpack.encode({"type": "TransformControlsUpdateMessage", "name": {}, "wxyz": None, "position": 1}),
+]
+
+
+@pytest.mark.slow  # waits for answers to each message
+def test_malformed_requests_and_messages_print_no_traceback(
+    page: Page, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    port, protocol = page.server.get_port(), [websockets.Subprotocol(f"viser-v{viser.__version__}")]
+    for garbage in GARBAGE:
+        with socket.create_connection((HOST, port)) as connection:
+            connection.sendall(garbage)
+            connection.shutdown(socket.SHUT_WR)
+            while connection.recv(4096):
+                pass
+    cookie = {"Cookie": f"egvs_explore_{port}={page.guard.key}"}
+    for message in MESSAGES:
+        with (
+            connect(
+                f"ws://{HOST}:{port}", additional_headers=cookie, origin=page.origin, subprotocols=protocol
+            ) as client,
+            suppress(TimeoutError, websockets.exceptions.ConnectionClosed),
+        ):
+            client.send(message)
+            while True:
+                client.recv(timeout=0.3)
+    gc.collect()
+    printed = "".join(capfd.readouterr())
+    assert b"viser" in with_key(page).open(page.origin).read()
+    assert "Traceback" not in caplog.text + printed
 
 
 def test_panel_notes_simplified_drawing(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import struct
@@ -13,7 +14,7 @@ import pytest
 import trimesh
 
 from egvs.core.errors import InputError
-from egvs.formats.meshes import MESH_FORMATS, are_closed, load_mesh, mesh_components
+from egvs.formats.meshes import MESH_FORMATS, are_closed, load_mesh, mesh_components, mesh_digests
 
 BOX = trimesh.creation.box((1, 2, 3))
 UNIT_BOX = trimesh.creation.box((1, 1, 1))
@@ -131,6 +132,41 @@ def test_buffer_that_is_no_file_in_the_folder_is_not_opened(tmp_path: Path, name
     (tmp_path / "points.bin").write_bytes(bytes(1000))
     with pytest.raises(InputError, match=f"m.gltf: cannot be loaded .*{name}' is no file in the folder of the mesh"):
         load_mesh(folder / "m.gltf", "m.gltf")
+
+
+def folder_with_links(tmp_path: Path, uri: str) -> Path:
+    """A glTF whose buffer is in the folder ``elsewhere``, which a link beside it leads to."""
+    document = json.loads(box_file("gltf"))
+    buffer = base64.b64decode(document["buffers"][0]["uri"].partition(",")[2])
+    document["buffers"][0]["uri"] = uri
+    folder, elsewhere = tmp_path / "meshes", tmp_path / "elsewhere" / "inside"
+    folder.mkdir()
+    elsewhere.mkdir(parents=True)
+    (folder / "m.gltf").write_text(json.dumps(document))
+    (elsewhere / "points.bin").write_bytes(buffer)
+    (elsewhere.parent / "secret.bin").write_bytes(buffer)
+    (folder / "linked").symlink_to(elsewhere)
+    (folder / "linked.bin").symlink_to(elsewhere / "points.bin")
+    return folder / "m.gltf"
+
+
+@pytest.mark.parametrize("uri", ["linked.bin", "linked/points.bin"])
+def test_link_counts_as_the_file_it_leads_to(tmp_path: Path, uri: str) -> None:
+    path = folder_with_links(tmp_path, uri)
+    assert len(load_mesh(path, "m.gltf").faces) == 12
+    before = mesh_digests(path, "m")
+    assert list(before) == ["m", f"m: {uri}"]
+    (tmp_path / "elsewhere" / "inside" / "points.bin").write_bytes(b"other")
+    assert mesh_digests(path, "m") != before
+
+
+@pytest.mark.parametrize(
+    "uri", ["linked/../secret.bin", "linked/../../elsewhere/secret.bin", "../elsewhere/secret.bin"]
+)
+def test_folder_above_a_link_is_not_opened(tmp_path: Path, uri: str) -> None:
+    path = folder_with_links(tmp_path, uri)
+    with pytest.raises(InputError, match=r"m\.gltf: cannot be loaded .*is no file in the folder of the mesh"):
+        load_mesh(path, "m.gltf")
 
 
 @pytest.mark.parametrize("name", COMPLETE_FILES)

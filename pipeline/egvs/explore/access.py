@@ -8,10 +8,14 @@ machine (DNS rebinding) do not work either, because requests must name this mach
 
 from __future__ import annotations
 
+import asyncio
 import http
+import logging
 import secrets
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
@@ -20,12 +24,17 @@ from websockets import Headers
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+_PACKAGE = Path(__file__).parents[1]
 KEY_PARAMETER = "key"
 """Parameter of the address's query."""
 
 _HOSTS = ("127.0.0.1", "localhost")
 _MAX_PATH_LENGTH = 4096
 _REFUSAL = 'Open the address that "egvs explore" printed in the terminal; it contains the key to this page.\n'
+
+# bytes that are no request, and messages that are none of the page, are answered or end their connection; websockets
+# would also print a traceback of each
+_SILENT = logging.Logger(f"{__name__}.connections", logging.CRITICAL + 1)
 
 RequestHandler = Callable[[ServerConnection, Request], Response | None]
 
@@ -62,7 +71,8 @@ class AccessGuard:
 
         def serve(*args: Any, process_request: RequestHandler, **options: Any) -> Any:
             self.is_active = True
-            return original(*args, process_request=self._guarded(process_request), **options)
+            asyncio.get_running_loop().set_exception_handler(_report_own_error)
+            return original(*args, process_request=self._guarded(process_request), logger=_SILENT, **options)
 
         websockets.asyncio.server.serve = serve  # type: ignore[assignment, misc]
         try:
@@ -118,6 +128,14 @@ class AccessGuard:
     def _is_key(self, value: str) -> bool:
         # bytes of a header that are not ASCII become surrogates
         return secrets.compare_digest(value.encode("utf-8", "surrogateescape"), self.key.encode())
+
+
+def _report_own_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Print the traceback of an error of this program, but none of a message that viser cannot interpret."""
+    error = context.get("exception")
+    frames = traceback.extract_tb(None if error is None else error.__traceback__)
+    if error is None or any(Path(frame.filename).is_relative_to(_PACKAGE) for frame in frames):
+        loop.default_exception_handler(context)
 
 
 def _cookie_name(port: int) -> str:

@@ -147,9 +147,12 @@ def mesh_digests(path: Path, name: str) -> dict[str, str]:
 
 
 def _existing_files(source: Path, names: Iterable[str]) -> list[Path]:
-    """Return the files with these names, relative to the folder of ``source`` or directly in it; each once."""
-    paths = [source.parent / location for name in names for location in (name, name.rpartition("/")[2])]
-    return [path for path in dict.fromkeys(paths) if _is_file(path)]
+    """Return the files with these names, relative to the folder of ``source`` or directly in it; each once.
+
+    Paths contain no ``..`` that leads back from inside the folder: behind a link, it would lead to another folder.
+    """
+    locations = [os.path.normpath(location) for name in names for location in (name, name.rpartition("/")[2])]
+    return [path for path in dict.fromkeys(source.parent / location for location in locations) if _is_file(path)]
 
 
 def _is_file(path: Path) -> bool:
@@ -236,12 +239,12 @@ def _make_resolver(source: Path) -> trimesh.resolvers.Resolver:
     """
     from trimesh.resolvers import FilePathResolver
 
-    folder = Path(os.path.normpath(source.parent))
+    folder = source.parent
 
     class Resolver(FilePathResolver):
         def get(self, name: str) -> bytes:
             for path in _existing_files(source, (name, name.strip(), unquote(name))):
-                if Path(os.path.normpath(path)).is_relative_to(folder):
+                if path.is_relative_to(folder) and ".." not in path.relative_to(folder).parts:
                     return limits.read_bytes(path, limits.FILE)
             raise FileNotFoundError(f"{name[:80]!r} is no file in the folder of the mesh")
 
