@@ -202,3 +202,8 @@ def test_number_of_holes_has_a_limit(tmp_path, monkeypatch):
     monkeypatch.setenv("EGVS_MAX_HOLES", "9")
     world, _ = build(tmp_path, walls)
     assert volumes(world) == pytest.approx([3 * (400 - 9 * 0.5)])
+    monkeypatch.setenv("EGVS_MAX_CORNERS", "3")
+    with pytest.raises(
+        DiagnosticsError, match=r"has 4 corners\. The limit is 3 corners; set EGVS_MAX_CORNERS to raise"
+    ):
+        build(tmp_path, walls)

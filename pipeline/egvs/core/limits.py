@@ -83,6 +83,9 @@ XML_ELEMENTS = Limit("EGVS_MAX_XML_ELEMENTS", 10_000_000, "elements", "an XML fi
 POINTS = Limit("EGVS_MAX_POINTS", 30_000_000, "points", "a point cloud")
 TRIANGLES = Limit("EGVS_MAX_TRIANGLES", 5_000_000, "triangles", "a mesh")
 HOLES = Limit("EGVS_MAX_HOLES", 5000, "holes", "one polygon: the time to triangulate it grows with their square")
+CORNERS = Limit(
+    "EGVS_MAX_CORNERS", 10_000, "corners", "one ring of a polygon: the time to triangulate it grows with their square"
+)
 EDGE_PAIRS = Limit(
     "EGVS_MAX_EDGE_PAIRS", 100_000, "pairs of edges", "one geometry that crosses itself or is widened, side by side"
 )

@@ -89,6 +89,16 @@ def _sides(parts: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return part_of_ring[ring[:-1][is_edge]][order], edge[order]
 
 
+def check_corners(shape: BaseGeometry, where: object) -> None:
+    """Raise an InputError when a polygon has many holes, or a ring of it many corners."""
+    import shapely
+
+    polygons = shapely.get_parts(shapely.get_parts(shape))
+    limits.HOLES.check(where, shapely.get_num_interior_rings(polygons).max(initial=0))
+    areas = polygons[shapely.get_type_id(polygons) == shapely.GeometryType.POLYGON]
+    limits.CORNERS.check(where, (shapely.get_num_coordinates(shapely.get_rings(areas)) - 1).max(initial=0))
+
+
 def check_edge_pairs(shape: BaseGeometry, where: object, radius_m: float = 0.0) -> None:
     """Raise an InputError when many edges of a shape are side by side.
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from egvs.core import limits
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.wording import format_percent, list_first
 from egvs.formats.georeference import Georeference
@@ -188,6 +189,7 @@ def _read_corners(path: Path, world: Georeference) -> dict[str, BaseGeometry]:
     for name, points in corners.items():
         if len(points) < _MIN_CORNERS:
             raise InputError(f"{path}: zone {name}", f"expected at least {_MIN_CORNERS} corners, got {len(points)}")
+        limits.CORNERS.check(f"{path}: zone {name}", len(points))
         polygon = shapely.Polygon(points)
         if not polygon.is_valid:
             reason = shapely.is_valid_reason(polygon)

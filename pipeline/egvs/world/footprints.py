@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from egvs.core import limits
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, find_misspelling
-from egvs.core.polygons import check_edge_pairs, repair_polygon
+from egvs.core.polygons import check_corners, check_edge_pairs, repair_polygon
 from egvs.core.reading import read_json
 from egvs.core.wording import number_of
 from egvs.formats import vector_files
@@ -279,7 +278,7 @@ def _parse_shape(geometry: Any, where: str) -> BaseGeometry:
         raise InputError(where, f"expected a GeoJSON geometry ({error})") from None
     if shape.is_empty:
         raise InputError(where, "the geometry is empty")
-    limits.HOLES.check(where, max((len(polygon.interiors) for polygon in _polygons_of(shape)), default=0))
+    check_corners(shape, where)
     if not np.isfinite(coordinates).all():
         raise InputError(where, "expected finite coordinates, got nan or inf")
     farthest_m = np.abs(coordinates).max()

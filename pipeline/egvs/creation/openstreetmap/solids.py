@@ -27,7 +27,7 @@ from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY
-from egvs.core.polygons import check_crossings, repair_polygon
+from egvs.core.polygons import check_corners, check_crossings, repair_polygon
 from egvs.creation.carriageway import clear_of_carriageway, geometry_pieces, lanes_under, large_pieces
 from egvs.creation.junctions import Streets
 from egvs.creation.map_parts import DECK_BASE_M, DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedSolid
@@ -153,6 +153,7 @@ def way_lines(way: Way, xy: dict[int, XY]) -> list[LineString]:
 def way_area(way: Way, xy: dict[int, XY], counts: ImportCounts) -> BaseGeometry:
     """Return the area inside a closed way, repaired where its outline crosses itself."""
     polygon = Polygon([xy[node] for node in way.nodes])
+    check_corners(polygon, f"way {way.id}")
     if polygon.is_valid:
         return polygon
     repaired = repair_polygon(polygon, f"way {way.id}")

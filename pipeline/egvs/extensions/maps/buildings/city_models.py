@@ -175,6 +175,7 @@ class _Collector:
 
         _check_coordinates(np.concatenate([ring for surface in rings for ring in surface]), where)
         limits.HOLES.check(where, max(len(surface) - 1 for surface in rings))
+        limits.CORNERS.check(where, max(len(ring) for surface in rings for ring in surface))
         placed = _Placed(rings, system)
         if not outside.is_in_window(placed, where):
             self.counts.drop(kind, OUT_OF_RANGE)

@@ -21,7 +21,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
-from egvs.core.polygons import repair_polygon
+from egvs.core.polygons import check_corners, repair_polygon
 from egvs.core.reading import read_json, translate_errors
 from egvs.creation.carriageway import geometry_pieces
 from egvs.creation.map_parts import DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MapContext, MappedSolid, SolidMap
@@ -102,6 +102,7 @@ def _read_area(
         counts.drop("building", "no_outline")
         return None
     moved = shapely.transform(shape, lambda xy: context.to_world(xy, crs, where))
+    check_corners(moved, f"{where}: geometry")
     counts.repaired += not moved.is_valid
     moved = repair_polygon(moved, f"{where}: geometry")
     polygons = [piece for piece in geometry_pieces(moved) if piece.geom_type == "Polygon" and piece.area > 0]
