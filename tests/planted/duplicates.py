@@ -87,14 +87,6 @@ DUPLICATES = (
         is_error=False,
     ),
     Case(
-        "types of tracks that differ in case",
-        tracks,
-        track(c=lambda row: "Truck" if row["n"] == "b" and row["t"] > 10 else row["c"]),
-        "tracks.csv",
-        "track",
-        extension="tracks",
-    ),
-    Case(
         "reported zones that differ in case",
         REPORTED,
         file("zones.geojson", lambda _: two_zones("Stop Line", "stop line")),

@@ -27,15 +27,15 @@ def queue() -> list[list[Box]]:
 
 
 def circle() -> list[list[Box]]:
-    """Five cars that drive round a small circle, each along its own axis."""
+    """Five cars that drive round a circle, each along its own axis."""
     length_m, width_m, height_m = SIZES_M["car"]
-    radius_m, speed_m_s = 6.0, 3.0
+    radius_m, speed_m_s = 14.0, 3.0
     tracks_of_cars = []
     for number in range(5):
         boxes = []
         for k in range(FRAMES):
             at_rad = 0.4 * math.pi * number + 0.05 + speed_m_s / radius_m * PERIOD_S * k
-            x_m, y_m = 8.0 + radius_m * math.cos(at_rad), -2.0 + radius_m * math.sin(at_rad)
+            x_m, y_m = -2.0 + radius_m * math.cos(at_rad), -2.0 + radius_m * math.sin(at_rad)
             yaw_rad = at_rad + 0.5 * math.pi
             size = (length_m, width_m, height_m)
             boxes.append(Box(f"c{number}", "car", x_m, y_m, 0.5 * height_m, yaw_rad, *size, speed_m_s))
@@ -44,7 +44,7 @@ def circle() -> list[list[Box]]:
 
 
 QUEUE = replace(STREET, periods=((1.0, traffic(*queue(), drive("b", "truck", 58.77, 1.57, -1.97))),))
-CIRCLE = replace(STREET, periods=((1.0, traffic(*circle())),))
+CIRCLE = replace(STREET, periods=((1.0, traffic(*circle())),), region_m=(-2.0, -2.0, 2.5), size_m=(24.0, 24.0, 5.0))
 
 
 def along(row: dict[str, Any], share: float) -> dict[str, float]:
@@ -96,5 +96,5 @@ REFERENCE_POINTS = (
     in_tracks("front bumpers in tracks", partial(tracks, QUEUE), 0.5, "these look like front bumpers"),
     in_tracks("rear bumpers in tracks", partial(tracks, QUEUE), -0.5, "these look like rear bumpers"),
     in_tracks("front bumpers of vehicles that turn", round_a_circle, 0.5, "turn about a point 1.00 lengths behind"),
-    in_tracks("rear bumpers of vehicles that turn", round_a_circle, -0.5, "turn about a point 0.00 lengths behind"),
+    in_tracks("rear bumpers of vehicles that turn", round_a_circle, -0.5, "these look like rear bumpers"),
 )

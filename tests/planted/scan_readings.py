@@ -95,12 +95,12 @@ SCANS = (
     scan_warning(
         "scan a metre too far east",
         lambda points_m, _: points_m + np.array([1.0, 0.0, 0.0]),
-        "100 % would be if moved by (-1.0, +0.0, -0.0) m",
+        "100 % would be if moved by (-1.0, +0.0, +0.0) m",
     ),
     scan_warning(
         "scan half a metre too far north",
         lambda points_m, _: points_m + np.array([0.0, 0.5, 0.0]),
-        "100 % would be if moved by (-0.0, -0.5, -0.0) m",
+        "100 % would be if moved by (+0.0, -0.5, +0.0) m",
     ),
     scan_warning(
         "scan pitched by three degrees", turned(0.0, -3.0), "100 % would be if turned by 3.0 degrees about the sensor"

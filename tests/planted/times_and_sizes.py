@@ -107,11 +107,11 @@ TIMES_AND_SIZES = (
         "subtract the start of the recording",
     ),
     Case(
-        "tenth of the times of FCD",
+        "fifth of the times of FCD",
         make(key("traffic.frame_period_s", 0.5)),
         both(fcd(time=lambda row: row["time"] / 5.0), key("traffic.frame_period_s", 0.1)),
         "traffic.fcd = 'fcd.csv'",
-        "times the speed limit (medians of",
+        "got 0.2 times the speed of the motion",
         is_error=False,
     ),
     Case(

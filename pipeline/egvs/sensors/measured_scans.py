@@ -312,7 +312,7 @@ def _moved_reading(scanner: Scanner, reading: Reading, parts: slice) -> Reading 
     turn_deg, distance_m = float(np.rad2deg(np.linalg.norm(turn_rad))), float(np.linalg.norm(shift_m))
     words = []
     if distance_m >= MIN_MOVE_M:
-        words.append("moved by ({:+.1f}, {:+.1f}, {:+.1f}) m".format(*shift_m))
+        words.append("moved by ({:+.1f}, {:+.1f}, {:+.1f}) m".format(*(np.round(shift_m, 1) + 0.0)))
     if turn_deg >= MIN_TURN_DEG:
         words.append(f"turned by {turn_deg:.1f} degrees about the sensor")
     if not words:

@@ -361,7 +361,7 @@ def warn_solids_over_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
     problem = f"{count} {format_percent(share)} of the lanes in and around the region: {named}"
     hint = "Move or lift them, or check their coordinates: traffic would drive through them."
     if share >= solid_readings.MIN_COVERED_SHARE:
-        reading = solid_readings.find_free_reading(inputs.world, lanes, low_m, high_m)
+        reading = solid_readings.describe_free_readings(inputs.world, lanes, low_m, high_m)
         if reading is not None:
             problem += f"; {reading}, they would cover almost none"
     yield Diagnostic("solids over lanes", "statics", problem, hint)

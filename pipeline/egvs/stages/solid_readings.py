@@ -27,7 +27,7 @@ MIN_COVERED_SHARE = 0.03
 """Share of the lanes that must be covered before other readings are tried."""
 
 MAX_FREE_SHARE = 0.1
-"""A reading is free of the lanes if it covers at most this share of what is covered without it."""
+"""In a reading that is free of the lanes, the share of the solids over lanes is at most this share of that without it."""
 
 MIN_BELOW_SHARE, MAX_BELOW_SHARE = 0.2, 0.02
 """Share of the area of a mesh below all roads: of one with y up, and of one that is turned as it should be."""
@@ -41,15 +41,15 @@ MIN_MESH_M = 0.2
 _FOOT_M = 0.3048
 
 _READINGS = {
-    "read in feet": np.diag([_FOOT_M, _FOOT_M]),
-    "read with x and y swapped": np.array([[0.0, 1.0], [1.0, 0.0]]),
-    "read with y mirrored": np.diag([1.0, -1.0]),
-    "read with x mirrored": np.diag([-1.0, 1.0]),
+    "in feet": np.diag([_FOOT_M, _FOOT_M]),
+    "with x and y swapped": np.array([[0.0, 1.0], [1.0, 0.0]]),
+    "with y mirrored": np.diag([1.0, -1.0]),
+    "with x mirrored": np.diag([-1.0, 1.0]),
 }
 
 
-def find_free_reading(world: World, lanes: Any, low_m: FloatArray, high_m: FloatArray) -> str | None:
-    """Return the first reading in which solids that cover lanes cover almost none; None if there is none.
+def describe_free_readings(world: World, lanes: Any, low_m: FloatArray, high_m: FloatArray) -> str | None:
+    """Return the readings in which solids that cover lanes cover almost none, in words; None if there is none.
 
     Parameters
     ----------
@@ -62,23 +62,23 @@ def find_free_reading(world: World, lanes: Any, low_m: FloatArray, high_m: Float
     """
     is_solid = np.array([kind != "ground" for _, kind in world.solids], dtype=np.bool_)
     triangles_m = world.triangles_m[is_solid[world.solid_of_face]][:, :, :2]
-    covered_m2, around = _covered_m2(triangles_m, lanes, low_m, high_m)
+    covered, around = _covered_share(triangles_m, lanes, low_m, high_m)
+    names = []
     for name, matrix in _READINGS.items():
-        read_m2, read_around = _covered_m2(triangles_m @ matrix.T, lanes, low_m, high_m)
-        if read_m2 <= MAX_FREE_SHARE * covered_m2 and 2 * read_around >= around:
-            return name
-    return None
+        read_covered, read_around = _covered_share(triangles_m @ matrix.T, lanes, low_m, high_m)
+        if read_covered <= MAX_FREE_SHARE * covered and 2 * read_around >= around:
+            names.append(name)
+    return f"read {' or '.join(names)}" if names else None
 
 
-def _covered_m2(triangles_m: FloatArray, lanes: Any, low_m: FloatArray, high_m: FloatArray) -> tuple[float, int]:
-    """Return the area of lanes under triangles in plan, (n, 3, 2), and how many of these are around."""
+def _covered_share(triangles_m: FloatArray, lanes: Any, low_m: FloatArray, high_m: FloatArray) -> tuple[float, int]:
+    """Return the share of triangles in plan, (n, 3, 2), that is over lanes, and how many of these are around."""
     import shapely
 
     is_around = (triangles_m.min(axis=1) <= high_m).all(axis=1) & (triangles_m.max(axis=1) >= low_m).all(axis=1)
     shapes = shapely.polygons(triangles_m[is_around])
-    touching = shapes[shapely.intersects(lanes, shapes)]
-    covered: float = shapely.union_all(shapely.intersection(touching, lanes)).area
-    return covered, int(is_around.sum())
+    over_lanes_m2 = float(shapely.area(shapely.intersection(shapes, lanes)).sum())
+    return over_lanes_m2 / max(float(shapely.area(shapes).sum()), 1e-9), int(is_around.sum())
 
 
 def warn_mesh_axes(inputs: CheckInputs) -> Iterator[Diagnostic]:

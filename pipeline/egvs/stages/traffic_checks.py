@@ -18,7 +18,7 @@ from egvs.effects import registry
 from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
-from egvs.stages import height_checks, name_checks
+from egvs.stages import height_checks
 from egvs.stages.inputs import CheckInputs, ErrorCollector
 from egvs.traffic import (
     class_sizes,
@@ -314,7 +314,6 @@ def _recorded_findings(scenario: Scenario, recorded: RecordedTraffic) -> list[Di
         return list(recorded.shared_names.findings(where))
     motor_types = frozenset(name for name, size in recorded.sizes.items() if size.vclass in ROAD_VCLASSES)
     findings = list(class_sizes.warn_unusual_sizes(recorded.sizes, where, _UNUSUAL_SHARE))
-    findings += name_checks.compare_names(recorded.sizes, where, "vehicle types")
     roads = sumo_folder.read_network(scenario)
     compared = road_check.check_tables(
         recorded.rows,

@@ -329,7 +329,7 @@ class RoadCheck:
         yield from self.names.findings(where)
         headings = list(self._heading_findings(where))
         yield from headings
-        if not headings:
+        if not any(finding.is_error for finding in headings):
             yield from self.reference.findings(where)
         yield from self._speed_findings(where)
         yield from self._clock_findings(where)
