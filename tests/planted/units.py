@@ -144,7 +144,7 @@ UNITS = (
         make(second_road),
         file("solids.geojson", lambda s: scenes.solids(s.truth.solids, place=lambda x, y: (x / FOOT_M, y / FOOT_M))),
         "statics",
-        "read in feet, they would cover almost none",
+        "read in feet or with x and y swapped",
         is_error=False,
     ),
     Case(

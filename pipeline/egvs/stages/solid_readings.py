@@ -27,7 +27,7 @@ MIN_COVERED_SHARE = 0.03
 """Share of the lanes that must be covered before other readings are tried."""
 
 MAX_FREE_SHARE = 0.1
-"""In a reading that is free of the lanes, the share of the solids over lanes is at most this share of that without it."""
+"""In a reading free of the lanes, the share of the solids over lanes is at most this part of the stated one."""
 
 MIN_BELOW_SHARE, MAX_BELOW_SHARE = 0.2, 0.02
 """Share of the area of a mesh below all roads: of one with y up, and of one that is turned as it should be."""

@@ -543,8 +543,8 @@ def traffic_warnings(
             one, other = statistics.twins
             problem = (
                 f"vehicles overlap in {format_percent(share, 0)} of the frames; {same_place} of these overlaps are of"
-                f" two vehicles in the same place, such as {one!r} and {other!r}: with two names, or listed"
-                " twice"
+                f" two vehicles in the same place, such as {one!r} and {other!r}: one vehicle with two names, or"
+                " listed twice"
             )
             hint = "Remove the copies, such as those of a second file or sensor; each would count as traffic."
         warnings.append(Diagnostic("overlaps", where, problem, hint))
