@@ -32,6 +32,7 @@ from egvs.traffic.lane_alignment import Alignment
 from egvs.traffic.network import Network
 from egvs.traffic.reference_points import ReferencePoints
 from egvs.traffic.road_lanes import RoadLanes
+from egvs.traffic.shared_names import MAX_SPEED_M_S, MIN_JUMP_M, SharedNames
 
 AROUND_M = 50.0
 """Vehicles farther from the region of interest than this do not count."""
@@ -56,9 +57,6 @@ AGAINST_DEG = 120.0
 
 ACROSS_DEG = 45.0
 """A heading that is farther off the motion than this is wrong."""
-
-MAX_SPEED_M_S, MIN_JUMP_M = 60.0, 2.0
-"""A step is a jump if it is longer than this distance and this speed allow."""
 
 WARN_SHARE = 0.1
 """Share of positions against the lanes, or of headings off the motion, that gets a warning."""
@@ -96,52 +94,8 @@ this length count, if they are this long together."""
 MIN_POSITIONS = 20
 """Shares of fewer positions are only warnings."""
 
-ERROR_SHARED_SHARE = 0.01
-"""Share of rows whose vehicle is in another place at the same time that is an error; of jumps, it gets a warning."""
-
-ERROR_JUMP_SHARE = 0.1
-"""Share of rows to which a vehicle jumps that is an error."""
-
 _MAX_POSITIONS = 4000
 """Positions of each table that are compared with lanes."""
-
-
-@dataclass
-class SharedNames:
-    """Signs that two vehicles share a name.
-
-    Attributes
-    ----------
-    rows
-        Number of rows.
-    repeated
-        Rows of a vehicle at a time at which it has another row, elsewhere.
-    jumps
-        Steps between two rows of a vehicle that are longer than any vehicle can move.
-    example
-        One of the vehicles, and when.
-    """
-
-    rows: int = 0
-    repeated: int = 0
-    jumps: int = 0
-    example: str = ""
-
-    def findings(self, where: str) -> Iterator[Diagnostic]:
-        """Yield an error if so many rows are concerned that vehicles are missing, or a warning."""
-        hint = "Give each vehicle a name of its own."
-        if self.repeated:
-            problem = (
-                f"expected one row for each vehicle and time, got {self.repeated:,} others in"
-                f" {number_of(self.rows, 'row')}, in other places ({self.example}): two vehicles share a name"
-            )
-            yield Diagnostic("shared names", where, problem, hint, self.repeated > ERROR_SHARED_SHARE * self.rows)
-        elif self.jumps > ERROR_SHARED_SHARE * self.rows:
-            problem = (
-                f"vehicles jump in {self.jumps:,} of {number_of(self.rows, 'row')}, faster than {MAX_SPEED_M_S:g} m/s:"
-                " two vehicles share a name, or times are wrong"
-            )
-            yield Diagnostic("jumps", where, problem, hint, self.jumps > ERROR_JUMP_SHARE * self.rows)
 
 
 @dataclass

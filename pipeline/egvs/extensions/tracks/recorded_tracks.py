@@ -34,8 +34,8 @@ from egvs.traffic.class_sizes import CLASS_SIZES, class_sizes
 from egvs.traffic.fcd import FCD_SCHEMA, FrameWindow
 from egvs.traffic.lane_alignment import Alignment
 from egvs.traffic.network import Network
-from egvs.traffic.road_check import MAX_SPEED_M_S
 from egvs.traffic.road_lanes import RoadLanes
+from egvs.traffic.shared_names import MAX_SPEED_M_S
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 FRAMES_EACH = 4096
