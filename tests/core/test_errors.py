@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import pytest
+
 from egvs.artefacts.run_record import StageRecord
 from egvs.cli.console import ProgressDisplay
 from egvs.core.errors import (
+    DECIMAL_COMMA_HINT,
     WARNINGS_KEY,
     Diagnostic,
     DiagnosticsError,
+    InputError,
     collect_warnings,
     unknown_site,
     with_relative_paths,
@@ -66,3 +70,23 @@ def test_unknown_site_lists_all_of_a_few() -> None:
     assert str(unknown_site("--site", "pole_z", ["b", "pole_a"], "this run has")) == (
         "--site: this run has no site 'pole_z'. Choose one of pole_a, b."
     )
+
+
+@pytest.mark.parametrize(
+    ("problem", "is_comma"),
+    [
+        ("expected a number, got '4,5'", True),
+        ("expected metres, at most 1e+08, got '-6,25'", True),
+        ("cannot be read as CSV (CSV conversion error to double: invalid value ',5')", True),
+        ("y: Failed to parse string: '1,57' as a scalar of type double", True),
+        ("expected a number, got '4,5,6'", False),
+        ("expected LAT,LON in degrees, got '50,9'", False),
+        ("expected a number, got 'x'", False),
+    ],
+)
+def test_decimal_comma_has_its_hint(problem: str, is_comma: bool) -> None:
+    assert InputError("a.csv", problem, "Use numbers.").hint == (DECIMAL_COMMA_HINT if is_comma else "Use numbers.")
+
+
+def test_further_errors_are_kept_beside_a_decimal_comma() -> None:
+    assert InputError("a.csv", "expected a number, got '4,5'", "\nb.csv: is empty").hint == "\nb.csv: is empty"

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from dataclasses import replace
 
+from tests.conftest import collection, feature
 from tests.planted import scenes
 from tests.planted.case import Case, add, both, fcd, file, key, make, site_names, text, track
+from tests.planted.reference_systems import xml_traffic
 from tests.planted.scenes import Scene, street, tracks
 from tests.planted.truth import (
     STREET,
@@ -25,6 +28,25 @@ def beam_table(truth: Truth, extra: str = "") -> str:
 NAMED = replace(STREET, mounts=(("Pfahl ä", STREET.mounts[0][1]), ("Pfahl b", STREET.mounts[1][1])))
 
 
+def two_zones(one: str, other: str) -> str:
+    """A file with two zones."""
+    rings = {one: [[5, -4], [15, -4], [15, 0], [5, 0]], other: [[20, -4], [30, -4], [30, 0], [20, 0]]}
+    return collection(
+        *(feature({"type": "Polygon", "coordinates": [[*ring, ring[0]]]}, name=name) for name, ring in rings.items())
+    )
+
+
+REPORTED = make(key("score.zones", "zones.geojson"), add("zones.geojson", two_zones("stop line", "crossing")))
+WEIGHTED_ZONE = {"polygon_m": [[5.0, -4.0], [15.0, -4.0], [15.0, 0.0], [5.0, 0.0]], "weight": 2.0}
+WEIGHTED = make(key("score.weights.zones", {"line": WEIGHTED_ZONE}), key("score.others", ["seen_well"]))
+
+
+def another_kind(scene: Scene) -> None:
+    """A kind named as another one, in upper case."""
+    kinds = scene.config["traffic.kinds"]
+    scene.config["traffic.kinds"] = [*kinds, {**kinds[0], "name": "CAR"}]
+
+
 def under_two_names(scene: Scene) -> str:
     """Each vehicle twice, under another name."""
     rows = scenes.fcd_rows(scene.truth.frames)
@@ -37,7 +59,54 @@ DUPLICATES = (
         street,
         file("fcd.csv", under_two_names),
         "scenario.toml: traffic",
-        "vehicles overlap in 100 % of the frames",
+        "two vehicles in the same place, such as 'a' and 'a2'",
+        is_error=False,
+    ),
+    Case(
+        "sites that differ in case",
+        street,
+        text("sites.csv", "pole_b", "Pole_A"),
+        "sites.csv",
+        "sites differ only in upper and lower case: pole_a and Pole_A",
+        is_error=False,
+    ),
+    Case(
+        "sensors that differ in case",
+        street,
+        key("sensors.Small", {**scenes.sensor(STREET), "range_m": 90.0}),
+        "scenario.toml: sensors",
+        "sensors differ only in upper and lower case: small and Small",
+        is_error=False,
+    ),
+    Case(
+        "kinds that differ in case",
+        street,
+        another_kind,
+        "scenario.toml: traffic.kinds",
+        "kinds differ only in upper and lower case: car and CAR",
+        is_error=False,
+    ),
+    Case(
+        "reported zones that differ in case",
+        REPORTED,
+        file("zones.geojson", lambda _: two_zones("Stop Line", "stop line")),
+        "scenario.toml: score.zones",
+        "zones differ only in upper and lower case: Stop Line and stop line",
+        is_error=False,
+    ),
+    Case(
+        "reported zones of two Unicode forms",
+        REPORTED,
+        file("zones.geojson", lambda _: two_zones("\u00c4cker", unicodedata.normalize("NFD", "\u00c4cker"))),
+        "scenario.toml: score.zones",
+        "zones differ only in the Unicode of accents",
+    ),
+    Case(
+        "weighted zones that differ in case",
+        WEIGHTED,
+        key("score.weights.zones", {"line": WEIGHTED_ZONE, "Line": WEIGHTED_ZONE}),
+        "scenario.toml: score.weights.zones",
+        "zones differ only in upper and lower case: line and Line",
         is_error=False,
     ),
     Case(
@@ -61,7 +130,7 @@ DUPLICATES = (
         street,
         text("solids.geojson", '"height_m": 6.0', '"height_m": "6,0"'),
         "solids.geojson: feature 0 (house): height_m",
-        "got '6,0'",
+        "got '6,0' Write numbers with a decimal point, not with a decimal comma",
     ),
     Case(
         "nan as a coordinate",
@@ -187,8 +256,17 @@ DUPLICATES = (
         street,
         file("fcd.csv", lambda s: s.files["fcd.csv"].replace(".", ",")),
         "fcd.csv",
-        "invalid value '0,5'",
+        "invalid value '0,5') Write numbers with a decimal point, not with a decimal comma",
     ),
+    Case(
+        "decimal commas of FCD in XML",
+        make(xml_traffic("")),
+        file("fcd.xml", lambda s: re.sub(r"(\d)\.(\d)", r"\1,\2", str(s.files["fcd.xml"]))),
+        "fcd.xml",
+        "not with a decimal comma",
+    ),
+    Case("decimal comma in a site", street, text("sites.csv", "12.2", '"12,2"'), "row pole_a: y_m", "decimal comma"),
+    Case("decimal comma in the scenario", street, key("roi.voxel_m", "0,5"), "roi.voxel_m", "decimal comma"),
     Case(
         "decimal commas of tracks",
         tracks,
@@ -197,7 +275,7 @@ DUPLICATES = (
             file("tracks.csv", lambda s: s.files["tracks.csv"].replace(",", ";").replace(".", ",")),
         ),
         "tracks.csv",
-        "expected a number, got '4,5'",
+        "expected a number, got '4,5' Write numbers with a decimal point, not with a decimal comma",
         extension="tracks",
     ),
     Case(

@@ -70,6 +70,12 @@ def scan_warning(name: str, change: Callable[[FloatArray, Mount], FloatArray], w
     return replace(scan_case(name, change, words), is_error=False)
 
 
+def turned(yaw_deg: float, pitch_deg: float) -> Callable[[FloatArray, Mount], FloatArray]:
+    """Turn the points about the sensor and the axes of the world."""
+    turn = Mount(0.0, 0.0, 0.0, yaw_deg, pitch_deg)
+    return lambda points_m, mount: mount.position_m + turn.to_world(points_m - mount.position_m)
+
+
 SCANS = (
     scan_warning(
         "scan with two returns for each beam",
@@ -84,8 +90,22 @@ SCANS = (
     scan_warning(
         "scan a metre too high",
         lambda points_m, _: points_m + np.array([0.0, 0.0, 1.0]),
-        "of 616 compared points are on surfaces of the static world, seen from the site, and no more in",
+        "100 % would be if moved by (+0.0, +0.0, -1.0) m",
     ),
+    scan_warning(
+        "scan a metre too far east",
+        lambda points_m, _: points_m + np.array([1.0, 0.0, 0.0]),
+        "100 % would be if moved by (-1.0, +0.0, +0.0) m",
+    ),
+    scan_warning(
+        "scan half a metre too far north",
+        lambda points_m, _: points_m + np.array([0.0, 0.5, 0.0]),
+        "100 % would be if moved by (+0.0, -0.5, +0.0) m",
+    ),
+    scan_warning(
+        "scan pitched by three degrees", turned(0.0, -3.0), "100 % would be if turned by 3.0 degrees about the sensor"
+    ),
+    scan_warning("scan turned by ten degrees", turned(10.0, 0.0), "degrees about the sensor"),
     scan_warning(
         "scan in millimetres",
         lambda points_m, _: points_m * 1000.0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -13,9 +14,11 @@ from tests.planted.scenes import Scene, street, tracks
 from tests.planted.truth import (
     STREET,
     Mount,
+    Prism,
 )
 
 FOOT_M = 0.3048
+ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
 
 NARROW = replace(
     STREET,
@@ -40,6 +43,28 @@ def feet_tracks() -> Scene:
     ]
     scene.files["tracks.csv"] = scenes.csv_text(rows)
     return scene
+
+
+TURNED = replace(
+    STREET,
+    solids=(*STREET.solids, Prism("hall", ((-3.0, 14.0), (3.0, 14.0), (3.0, 24.0), (-3.0, 24.0)), 0.0, 5.0)),
+)
+"""With a hall whose coordinates, swapped, are on the road."""
+
+
+def second_road(scene: Scene) -> None:
+    """Add a road to the north, where the house would be in feet."""
+    lane = '<lane id="north_0" index="0" length="130" speed="13.9" shape="-40,21 90,21"/>'
+    scene.replace("net.net.xml", "</net>", f'<edge id="north" from="n" to="m">{lane}</edge>\n</net>')
+
+
+def y_up(prisms: Sequence[Prism]) -> str:
+    """A Wavefront file with y up."""
+    turned = []
+    for line in scenes.obj_mesh(prisms).splitlines():
+        word, *values = line.split(" ")
+        turned.append(f"v {values[0]} {values[2]} {-float(values[1]):.6f}" if word == "v" else line)
+    return "\n".join(turned) + "\n"
 
 
 UNITS = (
@@ -89,6 +114,84 @@ UNITS = (
         file("solids.obj", lambda _: scenes.obj_mesh(STREET.solids, 1000.0)),
         "solids.obj",
         "15 km from the region of interest",
+    ),
+    Case(
+        "mesh in kilometres",
+        partial(mesh_scene, STREET),
+        file("solids.obj", lambda _: scenes.obj_mesh(STREET.solids, 0.001)),
+        "statics.meshes = 'solids.obj'",
+        "expected a mesh in metres, got one of 0.016 x 0.016 x 0.006 m",
+        is_error=False,
+    ),
+    Case(
+        "mesh in centimetres",
+        partial(mesh_scene, STREET),
+        file("solids.obj", lambda _: scenes.obj_mesh(STREET.solids, 100.0)),
+        "statics",
+        "the nearest solid is 1,446 m from the region of interest",
+        is_error=False,
+    ),
+    Case(
+        "mesh with y up",
+        partial(mesh_scene, STREET),
+        file("solids.obj", lambda _: y_up(STREET.solids)),
+        "statics.meshes = 'solids.obj'",
+        "stands on the ground beside the roads only with y up",
+        is_error=False,
+    ),
+    Case(
+        "footprints in feet",
+        make(second_road),
+        file("solids.geojson", lambda s: scenes.solids(s.truth.solids, place=lambda x, y: (x / FOOT_M, y / FOOT_M))),
+        "statics",
+        "read in feet or with x and y swapped",
+        is_error=False,
+    ),
+    Case(
+        "x and y of footprints swapped",
+        make(truth=TURNED),
+        file("solids.geojson", lambda s: scenes.solids(s.truth.solids, place=lambda x, y: (y, x))),
+        "statics",
+        "read with x and y swapped, they would cover almost none",
+        is_error=False,
+    ),
+    Case(
+        "footprints on the road without a network",
+        make(key("traffic.roads", None)),
+        file("solids.geojson", lambda s: scenes.solids(s.truth.solids, place=lambda x, y: (x, y - 6.5))),
+        "statics",
+        "of the volume that vehicles occupy is inside solids",
+        is_error=False,
+    ),
+    Case(
+        "angles of sites in radians",
+        street,
+        mounts(lambda mount: replace(mount, **{name: round(math.radians(getattr(mount, name)), 4) for name in ANGLES})),
+        "sites",
+        "with yaws that look like radians: 0.5236, 2.3963",
+        is_error=False,
+    ),
+    Case(
+        "pitch beyond the vertical",
+        street,
+        mounts(lambda mount: replace(mount, pitch_deg=95.0)),
+        "sites.csv: row pole_a: pitch_deg",
+        "expected an angle between -90 and 90, got 95",
+    ),
+    Case(
+        "heights of sites in centimetres",
+        street,
+        mounts(lambda mount: replace(mount, z_m=mount.z_m * 100.0)),
+        "site pole_a",
+        "305.0 m from the region of interest",
+    ),
+    Case(
+        "heights of sites in decimetres",
+        street,
+        mounts(lambda mount: replace(mount, z_m=mount.z_m * 10.0)),
+        "sites",
+        "all sensors are 32.0 m above the road beside them (median)",
+        is_error=False,
     ),
     Case(
         "FCD angles in radians",

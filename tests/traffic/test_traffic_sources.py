@@ -14,7 +14,7 @@ from egvs.scenario.loading import load
 from egvs.stages import check
 from egvs.traffic import traffic_sources
 from egvs.traffic.fcd import FrameWindow
-from egvs.traffic.road_check import SharedNames
+from egvs.traffic.shared_names import SharedNames
 from egvs.traffic.traffic_sources import RecordedTraffic
 from tests.installed import needs
 

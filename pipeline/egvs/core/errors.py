@@ -28,6 +28,14 @@ MAX_LINE_LENGTH, MAX_LINES = 600, 200
 _CONTROL_CHARACTERS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """Characters that control a terminal, and lone surrogates, which cannot be encoded."""
 
+_DECIMAL_COMMA = re.compile(
+    r"(?:number|metres|height|angle|pose|invalid value)\b.*'[-+]?\d*,\d+'|'[-+]?\d*,\d+' as a scalar"
+)
+"""A problem with a number that is written with a decimal comma."""
+
+DECIMAL_COMMA_HINT = "Write numbers with a decimal point, not with a decimal comma."
+"""Hint of an error about such a number."""
+
 
 class EgvsError(Exception):
     """Base of all errors that this program raises on purpose."""
@@ -53,6 +61,8 @@ class InputError(EgvsError):
     def __init__(self, where: object, problem: str, hint: str = "") -> None:
         self.where = truncate_text(str(where))
         self.problem = truncate_text(problem)
+        if _DECIMAL_COMMA.search(self.problem) and not hint.startswith("\n"):  # further errors, but no hint
+            hint = DECIMAL_COMMA_HINT
         self.hint = truncate_text(hint)
         super().__init__(format_problem(self.where, self.problem, self.hint))
 

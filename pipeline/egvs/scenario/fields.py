@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -42,6 +42,21 @@ def same_name(name: str) -> str:
     True
     """
     return unicodedata.normalize("NFC", name)
+
+
+def similar_names(names: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Yield pairs of different names that differ only in upper and lower case, or in the Unicode of accents.
+
+    Examples
+    --------
+    >>> list(similar_names(["Pole 1", "pole 1", "pole 2"]))
+    [('Pole 1', 'pole 1')]
+    """
+    first_names: dict[str, str] = {}
+    for name in dict.fromkeys(names):
+        first = first_names.setdefault(same_name(same_name(name).casefold()), name)
+        if first != name:
+            yield first, name
 
 
 MAX_COORDINATE_M = 1e8

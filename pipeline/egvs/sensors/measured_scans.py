@@ -9,10 +9,14 @@ its range, at right angles to that surface: a small error of the pose moves grou
 from the ground. Where effects let beams through a surface, such as the crown of a tree, points on it agree, and points
 behind it.
 
+A scan that is moved by a metre, or turned by some degrees, is in the right frame. So the move that brings the points
+onto the surfaces that their beams meet is computed, once (:func:`_moved_reading`); it is a warning if many more points
+that are not on the ground agree then.
+
 Ground looks the same in many readings, so a reading fits clearly better if many more points agree
 (:data:`MIN_LARGE_GAIN`), or some more (:data:`MIN_GAIN`) and many of those that are not on the ground
-(:data:`MIN_STRUCTURE_GAIN`). Traffic, and what the map leaves out, agree in no reading. Nothing is searched: the stated
-pose is right, or one of the readings is.
+(:data:`MIN_STRUCTURE_GAIN`). Traffic, and what the map leaves out, agree in no reading. No pose is searched: the stated
+one is right or almost right, or one of the readings is.
 """
 
 from __future__ import annotations
@@ -51,6 +55,19 @@ MAX_REPEATED = 0.1
 MAX_OTHER_SITES = 20
 """Number of other sites, the nearest ones, that a scan is compared with."""
 
+NEAR_SURFACE_M = 3.0
+"""A point that is farther from the surface that its beam meets says nothing about a small move."""
+
+MIN_MOVE_M, MIN_TURN_DEG = 0.25, 0.5
+"""A smaller move and turn are within the accuracy of maps and poses."""
+
+MIN_MOVED_POINTS = 20
+"""A move fits better if at least this number of points that are not on the ground agree more, and
+:data:`MIN_STRUCTURE_GAIN` of them."""
+
+_MOVE_STEPS = 10
+_AS_GOOD_SHARE = 0.01
+_RIDGE = 1e-3
 _MAX_POINTS = 2000
 _MAX_COMPARED = 2_000_000
 _MIN_RANGE_M = 0.1
@@ -122,6 +139,12 @@ class Agreement:
             gain >= MIN_GAIN and structure_gain >= MIN_STRUCTURE_GAIN
         )
 
+    def fits_better_after_move(self, other: Agreement) -> bool:
+        """Whether more points agree than before a small move, and clearly more of those that are not on the ground."""
+        if self.on_structure - other.on_structure < MIN_MOVED_POINTS or self.share <= other.share:
+            return self.fits_better_than(other)
+        return self.structure_share - other.structure_share >= MIN_STRUCTURE_GAIN
+
 
 def check_measured_scans(scanner: Scanner, sites: Sequence[Site]) -> Iterator[Diagnostic]:
     """Yield what is wrong or doubtful with the measured scans of some sites.
@@ -192,7 +215,12 @@ def _warn_other_reading(
         f"{format_percent(agreement.share, 0)} of {number_of(agreement.points, 'compared point')} are on surfaces of"
         " the static world, seen from the site"
     )
-    if best_agreement.share >= MIN_AGREEING and best_agreement.fits_better_than(agreement):
+    moved, moved_agreement = _best_move(worlds, readings[0], agreement)
+    if moved_agreement.share > best_agreement.share:
+        problem = f"{text}; {format_percent(moved_agreement.share, 0)} would be {moved.name}"
+        hint = "Check the pose, and the position of the static world."
+        yield Diagnostic("measured scan", where, problem, hint)
+    elif best_agreement.share >= MIN_AGREEING and best_agreement.fits_better_than(agreement):
         problem = f"{text}; {format_percent(best_agreement.share, 0)} would be {best.name}"
         hint = "Save the points of this site, in the world frame; check the pose."
         yield Diagnostic("measured scan", where, problem, hint, is_error=True)
@@ -230,6 +258,76 @@ def _readings(site: Site, points_m: FloatArray, sites: Sequence[Site]) -> Iterat
         yield Reading(f"of site {other.name}, in its sensor's frame", other.pose, turned)
 
 
+def _best_move(worlds: Sequence[Scanner], reading: Reading, agreement: Agreement) -> tuple[Reading, Agreement]:
+    """Return the reading after a small move, and its agreement; those of the stated reading if no move fits better.
+
+    A shift alone, or a turn alone, is preferred to both if as many points agree.
+    """
+    moved = [(reading, agreement)]
+    for parts in (slice(3, 6), slice(0, 3), slice(0, 6)):
+        candidate = _moved_reading(worlds[0], reading, parts)
+        if candidate is None:
+            continue
+        moved_agreement = compare_with_world(worlds, candidate)
+        if moved_agreement.fits_better_after_move(agreement):
+            moved.append((candidate, moved_agreement))
+    best_share = max(moved_agreement.share for _, moved_agreement in moved)
+    return next(pair for pair in moved if pair[1].share >= best_share - _AS_GOOD_SHARE)
+
+
+def _moved_reading(scanner: Scanner, reading: Reading, parts: slice) -> Reading | None:
+    """Return a reading moved a little, so that its points are on the surfaces that their beams meet.
+
+    The move minimises the distances of the points from these surfaces, at right angles to them, in a linear
+    approximation; points far from theirs have no weight. Nothing is cast again.
+
+    Parameters
+    ----------
+    scanner
+        The scanner of the scene.
+    reading
+        The reading.
+    parts
+        Which parts of the move are free: the turn about the axes x, y, z of the world, and the shift along them.
+
+    Returns
+    -------
+    Reading or None
+        None where the move is within the accuracy of maps and poses.
+    """
+    range_m = np.linalg.norm(reading.ends_m, axis=1)
+    ends_m = reading.ends_m[range_m > _MIN_RANGE_M]
+    hits_m, normals, _ = _surfaces_met(scanner, reading.pose, ends_m)
+    off_m = ((ends_m - hits_m) * normals).sum(axis=1)
+    is_near = np.abs(off_m) <= NEAR_SURFACE_M
+    ends_m, normals, off_m = ends_m[is_near], normals[is_near], off_m[is_near]
+    slopes = np.column_stack([np.cross(ends_m, normals), normals])[:, parts]
+    move = np.zeros(6)
+    for _ in range(_MOVE_STEPS):
+        left_m = off_m + slopes @ move[parts]
+        weighted = slopes / (1.0 + (left_m / ON_SURFACE_M) ** 2)[:, None]
+        matrix = weighted.T @ slopes + _RIDGE * np.eye(slopes.shape[1])
+        move[parts] = np.linalg.solve(matrix, -weighted.T @ off_m)
+    turn_rad, shift_m = move[:3], move[3:]
+    turn_deg, distance_m = float(np.rad2deg(np.linalg.norm(turn_rad))), float(np.linalg.norm(shift_m))
+    words = []
+    if distance_m >= MIN_MOVE_M:
+        words.append("moved by ({:+.1f}, {:+.1f}, {:+.1f}) m".format(*(np.round(shift_m, 1) + 0.0)))
+    if turn_deg >= MIN_TURN_DEG:
+        words.append(f"turned by {turn_deg:.1f} degrees about the sensor")
+    if not words:
+        return None
+    return Reading(f"if {' and '.join(words)}", reading.pose, reading.ends_m @ _rotation(turn_rad).T + shift_m)
+
+
+def _rotation(turn_rad: FloatArray) -> FloatArray:
+    """Return the matrix of a rotation about an axis, by the length of the vector."""
+    from scipy.spatial.transform import Rotation
+
+    matrix: FloatArray = Rotation.from_rotvec(turn_rad).as_matrix()
+    return matrix
+
+
 def compare_with_world(worlds: Sequence[Scanner], reading: Reading) -> Agreement:
     """Count the points of a reading that are on surfaces of the static world.
 
@@ -254,17 +352,28 @@ def compare_with_world(worlds: Sequence[Scanner], reading: Reading) -> Agreement
 
 def _compare_points(scanner: Scanner, pose: Pose, ends_m: FloatArray, range_m: FloatArray) -> tuple[Bools, Bools]:
     """Return whether points are on the surface that their beam meets, and whether that is the ground, (n,) each."""
+    hits_m, normals, is_ground = _surfaces_met(scanner, pose, ends_m)
+    off_m = np.abs(((hits_m - ends_m) * normals).sum(axis=1))
+    return off_m <= ON_SURFACE_M + ON_SURFACE_SHARE * range_m, is_ground
+
+
+def _surfaces_met(scanner: Scanner, pose: Pose, ends_m: FloatArray) -> tuple[FloatArray, FloatArray, Bools]:
+    """Return where the beams through points meet a surface, its normal there, (n, 3), and whether it is the ground.
+
+    Positions are relative to the sensor; positions and normals are NaN where a beam meets nothing.
+    """
     world = scanner.opaque_world
+    range_m = np.linalg.norm(ends_m, axis=1)
     hits = scanner.sweep_from(pose, ends_m / range_m[:, None], 2.0 * float(range_m.max()))
     face = hits.face
     assert face is not None, "a sweep has faces"
     hit = face >= 0
     corners_m = world.triangles_m[face[hit]]
-    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    hits_m, normals = np.full((2, *ends_m.shape), np.nan)
+    hits_m[hit] = hits.ends_m[hit]
+    normals[hit] = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    off_m = np.abs(((hits.ends_m[hit] - ends_m[hit]) * normals).sum(axis=1))
-    is_on_surface, is_ground = np.zeros((2, len(ends_m)), dtype=np.bool_)
-    is_on_surface[hit] = off_m <= ON_SURFACE_M + ON_SURFACE_SHARE * range_m[hit]
+    is_ground = np.zeros(len(ends_m), dtype=np.bool_)
     ground_solids = np.array([kind == "ground" for _, kind in world.solids], dtype=np.bool_)
     is_ground[hit] = ground_solids[world.solid_of_face[face[hit]]]
-    return is_on_surface, is_ground
+    return hits_m, normals, is_ground

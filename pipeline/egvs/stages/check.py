@@ -15,7 +15,7 @@ from egvs.core.wording import list_first
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
-from egvs.stages import height_checks, scene_checks, scene_inputs, traffic_checks
+from egvs.stages import height_checks, name_checks, scene_checks, scene_inputs, solid_readings, traffic_checks
 from egvs.stages import inputs as stage_inputs
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.inputs import CheckInputs, Inputs
@@ -39,11 +39,13 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     traffic_checks.warn_vehicle_sizes,
     traffic_checks.check_counts,
     traffic_checks.check_observed,
+    name_checks.check_similar_names,
     scene_checks.check_sensors_known,
     scene_checks.warn_repeated_beams,
     scene_checks.warn_few_beams,
     scene_checks.check_effects,
     scene_checks.check_poses,
+    scene_checks.warn_radians,
     scene_checks.warn_equal_sites,
     scene_checks.warn_sites_on_lanes,
     scene_checks.warn_own_supports,
@@ -51,12 +53,13 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     scene_checks.warn_solids_over_lanes,
     scene_checks.warn_repeated_solids,
     scene_checks.warn_solids_far_away,
+    solid_readings.warn_mesh_axes,
     height_checks.check_heights,
     traffic_checks.check_traffic_heights,
 )
 """In the order in which findings are reported. A new rule is a function in this list."""
 
-_SCENE_MODULES = (scene_checks.__name__, height_checks.__name__)
+_SCENE_MODULES = (scene_checks.__name__, name_checks.__name__, solid_readings.__name__, height_checks.__name__)
 """Modules of rules that read no traffic."""
 
 _RECORDED_TRAFFIC_KEY = "fcd"

@@ -8,6 +8,7 @@ areas of the lanes in plan.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Hashable, Iterator
 from functools import lru_cache, partial
@@ -28,6 +29,7 @@ from egvs.sensors import sensor, site_feasibility
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.sites import Site
+from egvs.stages import solid_readings
 from egvs.stages.inputs import CheckInputs, ErrorCollector
 from egvs.traffic import sumo_folder
 from egvs.traffic.network import Network
@@ -171,6 +173,7 @@ def _effect_errors(effect: Effect[Any], scene: Scene) -> Iterator[Diagnostic]:
 MAX_LISTED_SITES = 8
 """Number of sites that are listed one by one; the others share a line."""
 
+_ROUNDED_RAD = 0.01
 _CACHED_MOUNTS = 4  # 57,600 beams take 1.4 MB; sites with the same mount follow one another
 
 
@@ -198,6 +201,23 @@ def check_poses(inputs: CheckInputs) -> Iterator[Diagnostic]:
         names = list_first(blind, MAX_LISTED_SITES)
         problem = f"{len(blind)} of {len(inputs.sites)} sites have no beam that meets the region of interest: {names}"
         yield Diagnostic("beams beside the region", "sites", problem, "Change yaw, pitch, position or sensor.")
+
+
+MIN_RADIANS_YAW = 1.5
+"""In radians, this is a quarter turn; in degrees, more than a calibration corrects."""
+
+
+def warn_radians(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about sites whose angles look like radians: all small, with yaws that are not round and far apart."""
+    angles = [abs(angle) for site in inputs.sites for angle in site.pose.angles_deg]
+    yaws = dict.fromkeys(site.pose.yaw_deg for site in inputs.sites if site.pose.yaw_deg)
+    is_round = any(abs(10.0 * yaw - round(10.0 * yaw)) < 1e-6 for yaw in yaws)
+    if len(yaws) < 2 or is_round or max(angles) > 2.0 * math.pi + _ROUNDED_RAD:
+        return
+    if max(map(abs, yaws)) >= MIN_RADIANS_YAW:
+        listed = list_first([f"{yaw:g}" for yaw in yaws], MAX_LISTED_SITES)
+        problem = f"expected angles in degrees, got none above 2 pi, with yaws that look like radians: {listed}"
+        yield Diagnostic("angles", "sites", problem, "Convert yaw_deg, pitch_deg and roll_deg to degrees.")
 
 
 def warn_equal_sites(inputs: CheckInputs) -> Iterator[Diagnostic]:
@@ -340,6 +360,10 @@ def warn_solids_over_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
     count = f"{number_of(len(covered), 'solid')} {by_number(len(covered), 'covers', 'cover')}"
     problem = f"{count} {format_percent(share)} of the lanes in and around the region: {named}"
     hint = "Move or lift them, or check their coordinates: traffic would drive through them."
+    if share >= solid_readings.MIN_COVERED_SHARE:
+        reading = solid_readings.describe_free_readings(inputs.world, lanes, low_m, high_m)
+        if reading is not None:
+            problem += f"; {reading}, they would cover almost none"
     yield Diagnostic("solids over lanes", "statics", problem, hint)
 
 

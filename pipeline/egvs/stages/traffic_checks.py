@@ -302,7 +302,8 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         yield from finished_fcd.presence_warnings(scenario, content)
         if vtypes is not None:
             classes = finished_fcd.vehicle_classes(scenario, content, vtypes)
-            yield from errors.attempt("traffic", partial(_fcd_findings, inputs, classes)) or ()
+            lengths_m = finished_fcd.vehicle_lengths_m(scenario, content, vtypes)
+            yield from errors.attempt("traffic", partial(_fcd_findings, inputs, classes, lengths_m)) or ()
     yield from errors.findings
 
 
@@ -315,12 +316,18 @@ def _recorded_findings(scenario: Scenario, recorded: RecordedTraffic) -> list[Di
     findings = list(class_sizes.warn_unusual_sizes(recorded.sizes, where, _UNUSUAL_SHARE))
     roads = sumo_folder.read_network(scenario)
     compared = road_check.check_tables(
-        recorded.rows, roads, scenario.roi.box, motor_types - recorded.uncounted_types, recorded.shared_names
+        recorded.rows,
+        roads,
+        scenario.roi.box,
+        motor_types - recorded.uncounted_types,
+        recorded.shared_names,
+        {name: size.length_m for name, size in recorded.sizes.items()},
+        are_centres=True,
     )
     return [*findings, *compared.findings(where)]
 
 
-def _fcd_findings(inputs: CheckInputs, classes: Mapping[str, str]) -> list[Diagnostic]:
+def _fcd_findings(inputs: CheckInputs, classes: Mapping[str, str], lengths_m: Mapping[str, float]) -> list[Diagnostic]:
     """Compare the vehicles of a finished FCD file with the roads."""
     scenario = inputs.scenario
     name = scenario.traffic.fcd
@@ -330,7 +337,8 @@ def _fcd_findings(inputs: CheckInputs, classes: Mapping[str, str]) -> list[Diagn
     if finished_fcd.read_fcd_metadata(path) is None:
         rows = fcd.georeference_rows(rows, inputs.georeference, path, scenario.traffic.fcd_geo)
     motor_types = frozenset(name for name, vclass in classes.items() if vclass in ROAD_VCLASSES)
-    compared = road_check.check_tables(rows, sumo_folder.read_network(scenario), scenario.roi.box, motor_types)
+    roads = sumo_folder.read_network(scenario)
+    compared = road_check.check_tables(rows, roads, scenario.roi.box, motor_types, lengths_m=lengths_m)
     return list(compared.findings(f"{sumo_folder.traffic_location(scenario)}.fcd = {name!r}"))
 
 

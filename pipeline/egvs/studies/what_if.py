@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core.errors import InputError
+from egvs.core.errors import DECIMAL_COMMA_HINT, InputError
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import number_or_nan, parse_decimal
 from egvs.core.platform import relative_path
@@ -474,7 +474,7 @@ def _check_vehicle_columns(path: Path, header: list[str]) -> list[str]:
 def _parse(text: str, where: str) -> float:
     value = number_or_nan(text, parse_decimal)
     if not abs(value) <= MAX_COORDINATE_M:
-        raise InputError(where, f"expected a number, got {text!r}", "Use decimal points, not decimal commas.")
+        raise InputError(where, f"expected a number, got {text!r}", DECIMAL_COMMA_HINT)
     return value
 
 

@@ -387,7 +387,10 @@ class _RowBatch:
         for i in np.flatnonzero(~valid):
             value = self.columns[name][int(i)].as_py()
             problem = f"{name} of {self._vehicle(i)} is {'empty' if value is None else value}"
-            raise self._error(i, problem, f"Use a finite number, at most {MAX_COORDINATE_M:g}.")
+            hint = f"Use a finite number, at most {MAX_COORDINATE_M:g}."
+            if name == "time" and value is not None:
+                hint += " Times are seconds; subtract the start of the recording from dates."
+            raise self._error(i, problem, hint)
 
     def milliseconds(self) -> NDArray[np.int64]:
         exact = _floats(self.columns["time"]) * 1000.0

@@ -32,6 +32,7 @@ from egvs.artefacts.frame_boxes import MAX_BOX_M, MIN_BOX_M
 from egvs.core import reading
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.files import temporary_folder
+from egvs.core.numbers import number_or_nan
 from egvs.formats import xml
 from egvs.scenario.fields import Name, Positive, StrictModel
 from egvs.scenario.model import Scenario
@@ -254,6 +255,24 @@ def vehicle_classes(scenario: Scenario, survey: FcdSurvey, vtypes: Collection[El
     known |= {vtype.attrib["id"]: vtype.get("vClass", CAR) for vtype in vtypes}
     known |= {name: size.vclass for name, size in sizes_of_kinds(scenario.traffic.named_kinds).items()}
     return {name: known[name] for name in survey.types}
+
+
+def vehicle_lengths_m(scenario: Scenario, survey: FcdSurvey, vtypes: Collection[Element]) -> dict[str, float]:
+    """Return the length of the vehicle types of a finished file that the scenario or the file states.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    survey
+        Content of the file.
+    vtypes
+        From :func:`check_types`.
+    """
+    known = {name: size.length_m for name, size in sizes_of_kinds(scenario.traffic.kinds).items()}
+    known |= {name: size.length_m for name, size in survey.sizes.items()}
+    known |= {vtype.attrib["id"]: number_or_nan(vtype.get("length", "")) for vtype in vtypes}
+    return known | {name: size.length_m for name, size in sizes_of_kinds(scenario.traffic.named_kinds).items()}
 
 
 def _read_vtypes(paths: Collection[Path]) -> Iterator[Element]:

@@ -17,7 +17,7 @@ share is nothing, a larger one is a warning, and one that no traffic has is an e
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,7 +30,9 @@ from egvs.core.wording import format_percent, number_of
 from egvs.traffic import lane_alignment
 from egvs.traffic.lane_alignment import Alignment
 from egvs.traffic.network import Network
+from egvs.traffic.reference_points import ReferencePoints
 from egvs.traffic.road_lanes import RoadLanes
+from egvs.traffic.shared_names import MAX_SPEED_M_S, MIN_JUMP_M, SharedNames
 
 AROUND_M = 50.0
 """Vehicles farther from the region of interest than this do not count."""
@@ -55,9 +57,6 @@ AGAINST_DEG = 120.0
 
 ACROSS_DEG = 45.0
 """A heading that is farther off the motion than this is wrong."""
-
-MAX_SPEED_M_S, MIN_JUMP_M = 60.0, 2.0
-"""A step is a jump if it is longer than this distance and this speed allow."""
 
 WARN_SHARE = 0.1
 """Share of positions against the lanes, or of headings off the motion, that gets a warning."""
@@ -84,55 +83,19 @@ WARN_HEADING_DEG, ERROR_HEADING_DEG = 10.0, 20.0
 MAX_SPEED_RATIO = 1.5
 """Median of stated speeds over the speed of the motion, or of its inverse, that gets a warning: km/h are 3.6."""
 
+MAX_LIMIT_RATIO, MIN_FAST_M_S, MIN_FAST_POSITIONS = 2.0, 12.0, 5
+"""Median speed over the speed limit, and median speed, of vehicles that are faster than any traffic, at this number of
+positions: a wrong clock."""
+
+STRETCH_M, MIN_TOP_M_S, MIN_WAY_M, MIN_WAYS_M = 3.0, 2.5, 30.0, 100.0
+"""If nine of ten vehicles are slower than this on each stretch of their way, times are no seconds. Ways of at least
+this length count, if they are this long together."""
+
 MIN_POSITIONS = 20
 """Shares of fewer positions are only warnings."""
 
-ERROR_SHARED_SHARE = 0.01
-"""Share of rows whose vehicle is in another place at the same time that is an error; of jumps, it gets a warning."""
-
-ERROR_JUMP_SHARE = 0.1
-"""Share of rows to which a vehicle jumps that is an error."""
-
 _MAX_POSITIONS = 4000
 """Positions of each table that are compared with lanes."""
-
-
-@dataclass
-class SharedNames:
-    """Signs that two vehicles share a name.
-
-    Attributes
-    ----------
-    rows
-        Number of rows.
-    repeated
-        Rows of a vehicle at a time at which it has another row, elsewhere.
-    jumps
-        Steps between two rows of a vehicle that are longer than any vehicle can move.
-    example
-        One of the vehicles, and when.
-    """
-
-    rows: int = 0
-    repeated: int = 0
-    jumps: int = 0
-    example: str = ""
-
-    def findings(self, where: str) -> Iterator[Diagnostic]:
-        """Yield an error if so many rows are concerned that vehicles are missing, or a warning."""
-        hint = "Give each vehicle a name of its own."
-        if self.repeated:
-            problem = (
-                f"expected one row for each vehicle and time, got {self.repeated:,} others in"
-                f" {number_of(self.rows, 'row')}, in other places ({self.example}): two vehicles share a name"
-            )
-            yield Diagnostic("shared names", where, problem, hint, self.repeated > ERROR_SHARED_SHARE * self.rows)
-        elif self.jumps > ERROR_SHARED_SHARE * self.rows:
-            problem = (
-                f"vehicles jump in {self.jumps:,} of {number_of(self.rows, 'row')}, faster than {MAX_SPEED_M_S:g} m/s:"
-                " two vehicles share a name, or times are wrong"
-            )
-            yield Diagnostic("jumps", where, problem, hint, self.jumps > ERROR_JUMP_SHARE * self.rows)
 
 
 @dataclass
@@ -158,8 +121,16 @@ class RoadCheck:
         By how much each heading is off its motion, 0 to 180, of each table.
     speed_ratios
         Stated speed over the speed of the motion, of each table; without speeds of 0, which programs write for unknown.
+    limit_ratios, speeds_m_s
+        Speed over the limit of the lane, and speed, of positions on lanes, of each table.
+    top_speeds_m_s, ways_m
+        Speed on the fastest stretch of the way of each vehicle, and the length of the way, of each table.
     names
         Signs of shared names.
+    lengths_m
+        Length of the vehicles of each type, where it is known.
+    reference
+        Which point of a vehicle the positions are those of.
     """
 
     roads: Network | None
@@ -173,7 +144,13 @@ class RoadCheck:
     across: int = 0
     off_motion_deg: list[FloatArray] = field(default_factory=list)
     speed_ratios: list[FloatArray] = field(default_factory=list)
+    limit_ratios: list[FloatArray] = field(default_factory=list)
+    speeds_m_s: list[FloatArray] = field(default_factory=list)
+    top_speeds_m_s: list[FloatArray] = field(default_factory=list)
+    ways_m: list[FloatArray] = field(default_factory=list)
     names: SharedNames = field(default_factory=SharedNames)
+    lengths_m: Mapping[str, float] = field(default_factory=dict)
+    reference: ReferencePoints = field(default_factory=ReferencePoints)
 
     def __post_init__(self) -> None:
         self._lanes = None if self.roads is None else RoadLanes(self.roads)
@@ -193,6 +170,13 @@ class RoadCheck:
         vehicle, time_ms, xy_m = vehicle[order], time_ms[order], xy_m[order]
         yaw_rad, is_motor = np.deg2rad(90.0 - table["angle"].to_numpy()[order]), is_motor[order]
         self._count_shared(names.dictionary, vehicle, time_ms, xy_m)
+        types = table["type"].combine_chunks().dictionary_encode()
+        type_lengths_m = [self.lengths_m.get(name, np.nan) for name in types.dictionary.to_pylist()]
+        length_m = np.where(is_motor, np.array(type_lengths_m)[types.indices.to_numpy()[order]], np.nan)
+        self.reference.add(names.dictionary.to_pylist(), vehicle, time_ms, xy_m, yaw_rad, length_m)
+
+        near = is_motor & self._is_around(xy_m, AROUND_M)
+        self._add_top_speeds(vehicle[near], time_ms[near] / 1000.0, xy_m[near])
 
         first, second, motion_m = _motions(vehicle, time_ms, xy_m)
         counts = is_motor[first] & self._is_around(xy_m[first], AROUND_M)
@@ -205,11 +189,11 @@ class RoadCheck:
         self.speed_ratios.append(ratio[ratio > 0.0])  # others have no speed
         if self._lanes is not None and len(self._lanes):
             covered = self._is_around(xy_m[first], 0.0) | _is_inside(xy_m[first], *self._lanes.bounds_m)
-            first, motion_rad = first[covered], motion_rad[covered]
+            first, motion_rad, moved_m_s = first[covered], motion_rad[covered], moved_m_s[covered]
             if len(first) > _MAX_POSITIONS:
                 chosen = np.sort(np.random.default_rng(0).choice(len(first), _MAX_POSITIONS, replace=False))
-                first, motion_rad = first[chosen], motion_rad[chosen]
-            self._count_positions(self._lanes, xy_m[first], motion_rad)
+                first, motion_rad, moved_m_s = first[chosen], motion_rad[chosen], moved_m_s[chosen]
+            self._count_positions(self._lanes, xy_m[first], motion_rad, moved_m_s)
 
     def _is_around(self, xy_m: FloatArray, margin_m: float) -> NDArray[np.bool_]:
         low_m = np.array(self.region.origin_m[:2])
@@ -237,12 +221,40 @@ class RoadCheck:
         self.across += int((off_deg > ACROSS_DEG).sum())
         self.off_motion_deg.append(off_deg)
 
-    def _count_positions(self, lanes: RoadLanes, xy_m: FloatArray, motion_rad: FloatArray) -> None:
+    def _add_top_speeds(self, vehicle: IntArray, time_s: FloatArray, xy_m: FloatArray) -> None:
+        """Measure how fast each vehicle is on its fastest stretch; rows are by vehicle, then time."""
+        if len(vehicle) < 2:
+            return
+        same = np.diff(vehicle) == 0
+        way_m = np.append(0.0, np.cumsum(np.where(same, np.hypot(*np.diff(xy_m, axis=0).T), 0.0)))
+        marks_m = np.arange(0.0, way_m[-1], STRETCH_M)
+        row = np.searchsorted(way_m, marks_m, side="right") - 1
+        passed_s = time_s[row] + (marks_m - way_m[row]) / np.maximum(way_m[row + 1] - way_m[row], 1e-9) * (
+            time_s[row + 1] - time_s[row]
+        )
+        stretch_s = np.diff(passed_s)
+        counts = (np.diff(vehicle[row]) == 0) & (stretch_s > 0.0)
+        top_m_s = np.zeros(int(vehicle.max()) + 1)
+        np.maximum.at(top_m_s, vehicle[row[1:]][counts], STRETCH_M / stretch_s[counts])
+        stretches = np.bincount(vehicle[row[1:]][counts], minlength=len(top_m_s))
+        is_long = STRETCH_M * stretches >= MIN_WAY_M
+        self.top_speeds_m_s.append(top_m_s[is_long])
+        self.ways_m.append(STRETCH_M * stretches[is_long].astype(np.float64))
+
+    def _count_positions(
+        self, lanes: RoadLanes, xy_m: FloatArray, motion_rad: FloatArray, speed_m_s: FloatArray
+    ) -> None:
         in_junction = lanes.in_junctions(xy_m)
         near = lanes.near(xy_m, BESIDE_M)
         off_rad = np.abs(_wrap(motion_rad[near.row] - near.yaw_rad))
         on_lane = _mark(near.row, len(xy_m))
-        leads_on = _mark(near.row[off_rad <= np.deg2rad(SAME_WAY_DEG)], len(xy_m))
+        same_way = off_rad <= np.deg2rad(SAME_WAY_DEG)
+        leads_on = _mark(near.row[same_way], len(xy_m))
+        limit_m_s = np.zeros(len(xy_m))
+        np.maximum.at(limit_m_s, near.row[same_way], lanes.limits_m_s[near.lane[same_way]])
+        has_limit = limit_m_s > 0.0
+        self.limit_ratios.append(speed_m_s[has_limit] / limit_m_s[has_limit])
+        self.speeds_m_s.append(speed_m_s[has_limit])
         leads_elsewhere = _mark(near.row[off_rad <= np.deg2rad(AGAINST_DEG)], len(xy_m))
         against = on_lane & ~leads_elsewhere & ~in_junction
         off_lanes = ~leads_on & ~against
@@ -269,8 +281,12 @@ class RoadCheck:
             Key of the file, for messages.
         """
         yield from self.names.findings(where)
-        yield from self._heading_findings(where)
+        headings = list(self._heading_findings(where))
+        yield from headings
+        if not any(finding.is_error for finding in headings):
+            yield from self.reference.findings(where)
         yield from self._speed_findings(where)
+        yield from self._clock_findings(where)
         yield from self._position_findings(where)
 
     def _heading_findings(self, where: str) -> Iterator[Diagnostic]:
@@ -300,6 +316,29 @@ class RoadCheck:
             f" {number_of(len(ratios), 'speed')})"
         )
         yield Diagnostic("speeds", where, problem, "Convert the speeds to m/s, or check the times.")
+
+    def _clock_findings(self, where: str) -> Iterator[Diagnostic]:
+        """Warn about motion that is too fast or too slow for traffic."""
+        hint = "Check the times: frames and milliseconds are no seconds."
+        speeds = np.concatenate([np.empty(0), *self.speeds_m_s])
+        if len(speeds) >= MIN_FAST_POSITIONS:
+            ratio, speed_m_s = float(np.median(np.concatenate(self.limit_ratios))), float(np.median(speeds))
+            if ratio > MAX_LIMIT_RATIO and speed_m_s > MIN_FAST_M_S:
+                problem = (
+                    f"vehicles move at {speed_m_s:.0f} m/s, {ratio:.1f} times the speed limit (medians of"
+                    f" {number_of(len(speeds), 'position')} on lanes)"
+                )
+                yield Diagnostic("clock", where, problem, hint)
+        tops = np.concatenate([np.empty(0), *self.top_speeds_m_s])
+        if sum(float(ways.sum()) for ways in self.ways_m) < MIN_WAYS_M:
+            return
+        top_m_s = float(np.quantile(tops, 0.9))
+        if top_m_s < MIN_TOP_M_S:
+            problem = (
+                f"expected vehicles that drive, got {top_m_s:.2g} m/s as the highest speed of nine of ten (of"
+                f" {number_of(len(tops), 'vehicle')} that move on)"
+            )
+            yield Diagnostic("clock", where, problem, hint)
 
     def _position_findings(self, where: str) -> Iterator[Diagnostic]:
         alignment = self.alignment()
@@ -341,6 +380,9 @@ def check_tables(
     region: Roi,
     motor_types: frozenset[str],
     names: SharedNames | None = None,
+    lengths_m: Mapping[str, float] | None = None,
+    *,
+    are_centres: bool = False,
 ) -> RoadCheck:
     """Count the vehicles of some tables that do not fit the roads.
 
@@ -356,8 +398,13 @@ def check_tables(
         Vehicle types of motor vehicles.
     names
         Signs of shared names, where they were found before and the tables have no such rows any more.
+    lengths_m
+        Length of the vehicles of each type, where it is known.
+    are_centres
+        Whether the file, of which the tables are made, states centres of vehicles.
     """
-    check = RoadCheck(roads, region, motor_types)
+    reference = ReferencePoints(are_centres)
+    check = RoadCheck(roads, region, motor_types, lengths_m=lengths_m or {}, reference=reference)
     for table in tables:
         if table.num_rows:
             check.add(table)

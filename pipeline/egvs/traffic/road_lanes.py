@@ -79,11 +79,16 @@ class RoadLanes:
     ----------
     network
         The network.
+
+    Attributes
+    ----------
+    limits_m_s
+        Speed limit of each lane.
     """
 
     def __init__(self, network: Network) -> None:
         self._lines_m: list[FloatArray] = []
-        half_widths_m = []
+        half_widths_m, limits_m_s = [], []
         for edge in network.all_edges:
             for lane in edge.lanes:
                 line_m = lane.shape_m
@@ -92,7 +97,9 @@ class RoadLanes:
                     continue
                 self._lines_m.append(line_m)
                 half_widths_m.append((LANE_WIDTH_M if lane.width_m is None else lane.width_m) / 2.0)
+                limits_m_s.append(lane.speed_m_s)
         self._half_widths_m = np.array(half_widths_m)
+        self.limits_m_s = np.array(limits_m_s)
         self._junctions = [shape for shape in network.junctions if shape.type != "internal" and len(shape.shape_m) > 2]
 
     def __len__(self) -> int:

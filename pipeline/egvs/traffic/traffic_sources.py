@@ -25,7 +25,7 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.traffic import sumo_folder
 from egvs.traffic.fcd import FrameWindow
-from egvs.traffic.road_check import SharedNames
+from egvs.traffic.shared_names import SharedNames
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 GROUP = "egvs.traffic_sources"

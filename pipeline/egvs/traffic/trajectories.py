@@ -45,6 +45,12 @@ GROUP_FRAMES = 500
 SQUARE_M = 20.0
 """Overlaps are counted in squares of this side."""
 
+SAME_PLACE_M = 0.1
+"""Centres of two vehicles that are no farther apart are those of one vehicle."""
+
+MIN_TWIN_SHARE = 0.5
+"""Share of the overlaps whose vehicles are in the same place that gets another warning."""
+
 _SHRINK_M = 1e-3
 _MAX_CELLS = 2**20
 """Limit along x and along y, so that the number of a cell in a frame fits 64 bits."""
@@ -173,6 +179,8 @@ class TrafficStatistics:
         A vehicle that was standing for more frames made a long stop.
     stood_long
         Names of the vehicles with a long stop.
+    same_place, twins
+        Overlaps of two vehicles in the same place, and an example of their names.
     overlaps_by_square
         Overlaps in squares of :data:`SQUARE_M`, by number of the square to the east and to the north.
     standing_since
@@ -199,6 +207,8 @@ class TrafficStatistics:
     standing: int = 0
     overlapping_pairs: int = 0
     frames_with_overlap: int = 0
+    same_place: int = 0
+    twins: tuple[str, str] | None = None
     longest_standing_frames: int = 0
     stopped_on_purpose: Set[str] = frozenset()
     longest_jam: StandingVehicle | None = None
@@ -239,6 +249,7 @@ class TrafficStatistics:
         self.overlapping_pairs += len(pairs)
         first = pairs[:, 0]
         self.frames_with_overlap += np.unique(boxes.frame[first]).size
+        self._add_twins(boxes, pairs)
         east = np.floor(boxes.x_m[first] / SQUARE_M).astype(int)
         north = np.floor(boxes.y_m[first] / SQUARE_M).astype(int)
         self.overlaps_by_square.update(zip(east.tolist(), north.tolist(), strict=True))
@@ -247,6 +258,16 @@ class TrafficStatistics:
             self.rows_in_region += int(np.count_nonzero(in_region))
             is_blocker = standing_frames >= self.blocker_frames
             self.overlaps_in_region += int(np.count_nonzero((in_region & is_blocker)[pairs].any(axis=1)))
+
+    def _add_twins(self, boxes: VehicleBoxes, pairs: Ints) -> None:
+        """Count the overlaps whose boxes have the same centre."""
+        centres_m = np.column_stack([boxes.x_m, boxes.y_m, boxes.z_m])
+        distance_m = np.linalg.norm(centres_m[pairs[:, 0]] - centres_m[pairs[:, 1]], axis=1)
+        twins = pairs[distance_m <= SAME_PLACE_M]
+        self.same_place += len(twins)
+        if len(twins) and self.twins is None:
+            one, other = boxes.code[twins[0]]
+            self.twins = boxes.names[one], boxes.names[other]
 
     def _add_uncounted(self, boxes: VehicleBoxes, uncounted: NDArray[np.bool_], pairs: Ints) -> None:
         """Add the boxes that do not count as vehicles, and the overlaps of such boxes."""
@@ -516,6 +537,16 @@ def traffic_warnings(
             " here"
         )
         hint = "Enlarge the junction, or use signals where vehicles wait on it to give way."
+        if statistics.twins is not None and statistics.same_place >= MIN_TWIN_SHARE * statistics.overlapping_pairs:
+            where = recording.where
+            same_place = format_percent(statistics.same_place / statistics.overlapping_pairs, 0)
+            one, other = statistics.twins
+            problem = (
+                f"vehicles overlap in {format_percent(share, 0)} of the frames; {same_place} of these overlaps are of"
+                f" two vehicles in the same place, such as {one!r} and {other!r}: one vehicle with two names, or"
+                " listed twice"
+            )
+            hint = "Remove the copies, such as those of a second file or sensor; each would count as traffic."
         warnings.append(Diagnostic("overlaps", where, problem, hint))
     return warnings
 

@@ -56,14 +56,14 @@ class SolidSource:
     def zero_hint(self, change_m: float) -> str:
         """Return how to change where the heights of the file count from, by a number of metres."""
         change = f"{change_m:+,.1f} m"
-        if self.key == _MESHES:
+        if self.key == MESHES:
             return f"Add {change} to the third number of its offset_m."
         if self.key == _POLYGONS:
             return f"Add {change} to its heights (height, min_height): they count from the ground."
         return f"Add {change} to base_m and height_m: they count from the ground, or with z_datum = 'world' from z = 0."
 
 
-_FOOTPRINTS, _POLYGONS, _MESHES = "statics.footprints", "statics.polygons", "statics.meshes"
+_FOOTPRINTS, _POLYGONS, MESHES = "statics.footprints", "statics.polygons", "statics.meshes"
 
 
 @dataclass(frozen=True)
@@ -144,8 +144,8 @@ def build_world(
         progress("footprints", done + 1, len(footprints))
     for mesh in config.meshes:
         first = len(builder.solids)
-        _add_mesh(builder, scenario.find(mesh.file, _MESHES), mesh, world)
-        builder.counts.sources.append(SolidSource(_MESHES, mesh.file, first, len(builder.solids)))
+        _add_mesh(builder, scenario.find(mesh.file, MESHES), mesh, world)
+        builder.counts.sources.append(SolidSource(MESHES, mesh.file, first, len(builder.solids)))
     if config.ground and surface is not None:
         builder.add(surface.vertices_m, surface.faces, "ground", "ground")
     elif config.ground:

@@ -26,7 +26,7 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.extensions.tracks.model import Tracks
 from egvs.extensions.tracks.motion import motion_yaw_rad
 from egvs.traffic.class_sizes import ClassSize
-from egvs.traffic.road_check import MAX_SPEED_M_S, MIN_JUMP_M, SharedNames
+from egvs.traffic.shared_names import MAX_SPEED_M_S, MIN_JUMP_M, SharedNames
 
 MOVING_M_S = 3.0
 """Speed above which the direction of motion is certain enough to check a heading."""

@@ -21,6 +21,8 @@ _HINT = "Use the file as it was published, with its header row."
 MAX_SIZE_M = 100.0
 """No road user is longer; the longest trams have 75 m."""
 
+_ROW_HINT = "Correct the row, or remove it."
+
 MAX_TIME_S = 1e10
 """Seconds since 1970 stay below it until the year 2286; milliseconds exceed it."""
 
@@ -84,7 +86,8 @@ class Table:
 
     def times_s(self, name: str, unit_s: float = 1.0) -> FloatArray:
         """Return times in seconds, (n,) float64; InputError beyond :data:`MAX_TIME_S`."""
-        return self._within(self.numbers(name) * unit_s, name, -MAX_TIME_S, MAX_TIME_S, "a time", "s")
+        hint = "Check the unit of the times: milliseconds are no seconds."
+        return self._within(self.numbers(name) * unit_s, name, -MAX_TIME_S, MAX_TIME_S, "a time", "s", hint)
 
     def positions_m(self, name: str, unit_m: float = 1.0) -> FloatArray:
         """Return coordinates in metres, (n,) float64; InputError for those that are too large for the Earth."""
@@ -152,13 +155,15 @@ class Table:
                 )
         return np.array([row_of[key] for key in keys], dtype=np.int64)
 
-    def _within(self, values: FloatArray, name: str, low: float, high: float, what: str, unit: str) -> FloatArray:
+    def _within(
+        self, values: FloatArray, name: str, low: float, high: float, what: str, unit: str, hint: str = _ROW_HINT
+    ) -> FloatArray:
         for row in np.flatnonzero((values < low) | (values > high)):
             expected = f"expected {what} from {low:g} to {high:g} {unit}"
-            raise self.error(int(row), name, f"{expected}, got {values[row]:g} {unit}")
+            raise self.error(int(row), name, f"{expected}, got {values[row]:g} {unit}", hint)
         return values
 
-    def error(self, row: int, name: str, problem: str, hint: str = "Correct the row, or remove it.") -> InputError:
+    def error(self, row: int, name: str, problem: str, hint: str = _ROW_HINT) -> InputError:
         """Return an error about a cell; ``row`` counts from 0, without the header."""
         where = f"line {self.lines[row]}" if self.lines else f"row {row + 1}"
         return InputError(f"{self.path}: {where}: {name}", problem, hint)

@@ -34,8 +34,8 @@ from egvs.traffic.class_sizes import CLASS_SIZES, class_sizes
 from egvs.traffic.fcd import FCD_SCHEMA, FrameWindow
 from egvs.traffic.lane_alignment import Alignment
 from egvs.traffic.network import Network
-from egvs.traffic.road_check import MAX_SPEED_M_S
 from egvs.traffic.road_lanes import RoadLanes
+from egvs.traffic.shared_names import MAX_SPEED_M_S
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 FRAMES_EACH = 4096
@@ -342,7 +342,10 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
             f" long to be interpolated; in {number_of(frames, 'frame')} of a track its"
             " position is unknown"
         )
-        yield Diagnostic("track gaps", where, problem, "Raise track_gap_s if straight lines are good enough.")
+        hint = "Raise track_gap_s if straight lines are good enough."
+        if 2 * boxes.unknown_gaps > report.rows:
+            hint = "Most steps of the file are that long: check the unit of its times, such as time_unit."
+        yield Diagnostic("track gaps", where, problem, hint)
     if recorded.coverage is not None:
         yield from recorded.coverage.warnings(where)
 

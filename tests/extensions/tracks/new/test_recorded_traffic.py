@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -205,6 +207,16 @@ def mirror(table: pa.Table, centre_m: tuple[float, float]) -> pa.Table:
     return table
 
 
+def moved_along(table: pa.Table, lengths_m: Mapping[str, float], share: float) -> pa.Table:
+    """Move the vehicles of a table of rows of FCD along their axes by a share of their length."""
+    way_m = share * np.array([lengths_m[name] for name in table["type"].to_pylist()])
+    yaw_rad = np.deg2rad(90.0 - table["angle"].to_numpy())
+    for name, step_m in (("x", way_m * np.cos(yaw_rad)), ("y", way_m * np.sin(yaw_rad))):
+        values = pa.array(table[name].to_numpy() + step_m)
+        table = table.set_column(table.schema.get_field_index(name), name, values)
+    return table
+
+
 @pytest.mark.slow
 def test_vehicles_of_k733_fit_its_roads(k733: Path) -> None:
     """7 % of the positions are more than 1 m beside a lane that leads their way; mirrored, 71 %."""
@@ -212,13 +224,22 @@ def test_vehicles_of_k733_fit_its_roads(k733: Path) -> None:
     recorded = traffic_sources.source_of(scenario).record(scenario, geolocation.scenario_georeference(scenario))
     rows = list(recorded.rows)
     roads, motor_types = sumo_folder.read_network(scenario), frozenset(recorded.sizes) - recorded.uncounted_types
-    check = road_check.check_tables(rows, roads, scenario.roi.box, motor_types)
+    lengths_m = {name: size.length_m for name, size in recorded.sizes.items()}
+    compare = partial(
+        road_check.check_tables, roads=roads, region=scenario.roi.box, motor_types=motor_types, lengths_m=lengths_m
+    )
+    check = compare(rows, are_centres=True)
     assert list(check.findings("tracks")) == []
     assert check.off_lanes < 0.1 * check.positions
     centre_m = scenario.roi.center_m[:2]
     mirrored = [mirror(table, centre_m) for table in rows]
-    errors = list(road_check.check_tables(mirrored, roads, scenario.roi.box, motor_types).findings("tracks"))
+    errors = list(compare(mirrored, are_centres=True).findings("tracks"))
     assert ("vehicles off their lanes", True) in [(error.rule, error.is_error) for error in errors]
+    for share, likely in ((0.5, "front bumpers"), (-0.5, "rear bumpers")):
+        bumpers = [moved_along(table, lengths_m, share) for table in rows]
+        (warning,) = compare(bumpers, are_centres=True).findings("tracks")
+        assert (warning.rule, warning.is_error) == ("reference point", False)
+        assert f"look like {likely}" in warning.hint
 
 
 @pytest.mark.slow
