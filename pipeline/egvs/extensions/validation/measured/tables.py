@@ -49,7 +49,7 @@ def share_text(ratio: Ratio | None) -> str:
     return f"{share} %" if math.isnan(ratio.se) else f"{share} ± {200 * ratio.se:.0f} %"
 
 
-def range_text(row: PointsRow) -> str:
+def range_text(row: PointsRow | LevelRow | DetectionRow) -> str:
     """Return the ranges of a row."""
     return "all" if row.from_m is None else f"{row.from_m}-{row.to_m} m"
 
@@ -71,6 +71,7 @@ def level_columns(comparison: Comparison) -> list[Column[tuple[str, LevelRow]]]:
     """Return the columns of the table of levels; its rows are pairs of whose level it is, and a row."""
     columns: list[Column[tuple[str, LevelRow]]] = [
         Column("of", lambda row: row[1].group, "left"),
+        Column("range", lambda row: range_text(row[1]), "left"),
         Column("boxes", lambda row: f"{row[1].boxes:,}"),
         Column("level", lambda row: row[0], "left"),
     ]
@@ -99,6 +100,7 @@ def level_rows(comparison: Comparison) -> list[tuple[str, LevelRow]]:
 DETECTION_COLUMNS: list[Column[DetectionRow]] = [
     Column("detector", lambda row: row.detector, "left"),
     Column("of", lambda row: row.group, "left"),
+    Column("range", range_text, "left"),
     Column("boxes", lambda row: f"{row.boxes:,}"),
     Column("expected", lambda row: share_text(row.expected)),
     Column("simulated", lambda row: share_text(row.simulated)),
@@ -124,8 +126,8 @@ def sentences(comparison: Comparison) -> Iterator[str]:
     on_box, measured = points.on_box[cars].sum(), int(points.measured[cars].sum())
     if measured:
         yield (
-            f"Scores count points on boxes, not on bodies: with losses {on_box / measured:.2f} times the measured ones "
-            "on cars."
+            f"Scores count points on boxes, not on bodies: with losses, {on_box / measured:.2f} times the measured "
+            f"ones on cars, and {points.expected[cars].sum() / measured:.2f} times on bodies."
         )
     if comparison.convention is not None:
         name, held = comparison.convention
@@ -249,15 +251,16 @@ def to_json(comparison: Comparison) -> dict[str, Any]:
         "notes": list(sentences(comparison)),
         "boxes": [dict(zip(keys, box, strict=True)) for box in boxes],
     }
-    cleaned: dict[str, Any] = _without_nan(values)
+    cleaned: dict[str, Any] = without_nan(values)
     return cleaned
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
+    """Return JSON values with null for numbers that are not finite."""
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
+        return [without_nan(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
