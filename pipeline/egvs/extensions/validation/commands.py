@@ -187,7 +187,7 @@ def _validate_against(
         comparison = compare_labelled(request, loaded)
     tables.print_comparison(comparison)
     if out is not None:
-        for path in tables.write_comparison(comparison, out):
+        for path in tables.write_comparison(comparison, out, loaded):
             print(f"wrote {path}")
 
 
@@ -223,7 +223,7 @@ def _compare_labels(
         results = compare_lists(request, loaded)
     agreement_tables.print_agreement(results)
     if out is not None:
-        for path in agreement_tables.write_agreement(results, out):
+        for path in agreement_tables.write_agreement(results, out, loaded):
             print(f"wrote {path}")
 
 

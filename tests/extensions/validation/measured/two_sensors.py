@@ -103,7 +103,9 @@ def to_sensor(pose: Pose, boxes: FloatArray) -> FloatArray:
     return inside
 
 
-def write_openlabel(folder: Path, labels: list[Labels], pose: Pose | None, scores: list[FloatArray] | None = None) -> Path:
+def write_openlabel(
+    folder: Path, labels: list[Labels], pose: Pose | None, scores: list[FloatArray] | None = None
+) -> Path:
     """Write one file for each sweep in TUMTraf's dialect, with a pose of the sensor if there is one."""
     folder.mkdir()
     name = f"s110_lidar_{folder.name}"

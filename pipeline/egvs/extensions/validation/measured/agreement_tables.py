@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
 
 from egvs.cli.console import Column, print_sentences, print_table
 from egvs.core.wording import number_of
-from egvs.results.labels import join_names
+from egvs.extensions.validation.measured.figures import Panel, Series, range_figure
 from egvs.extensions.validation.measured.label_agreement import NEARER_M, AgreementRow, JudgedList, ScoreRow
 from egvs.extensions.validation.measured.list_poses import NEAR_M
+from egvs.extensions.validation.measured.pages import MeasuredPage, PageTable, write_pages
 from egvs.extensions.validation.measured.ratios import Ratio
-from egvs.extensions.validation.measured.tables import share_text
+from egvs.extensions.validation.measured.tables import share_text, without_nan
+from egvs.results.labels import join_names
+from egvs.scenario.model import Scenario
 from egvs.scoring.noticed import FARTHEST_M
 
 _FILE_WIDTH = 150
@@ -110,3 +115,58 @@ def print_agreement(results: Sequence[JudgedList]) -> None:
             print_sentences(["", "By the score of detections (± 2 se)"])
             print_table(SCORE_COLUMNS, judged.score_rows, file_width=_FILE_WIDTH)
         print_sentences(["", *sentences(judged)])
+
+
+def write_agreement(results: Sequence[JudgedList], folder: Path, scenario: Scenario | None = None) -> list[Path]:
+    """Write the results as JSON, and the page; return the files.
+
+    Errors and ``scenario`` as of :func:`egvs.extensions.validation.measured.pages.write_pages`.
+    """
+    values = [asdict(judged) | {"notes": list(sentences(judged))} for judged in results]
+    over = join_names([judged.name for judged in results])
+    return write_pages([to_page(judged) for judged in results], without_nan(values), over, folder, scenario)
+
+
+def to_page(judged: JudgedList) -> MeasuredPage:
+    """Return the part of the page on one judged list."""
+    tables = [PageTable.of("By range (± 2 se)", columns(judged), judged.rows)]
+    if judged.point_rows:
+        heading = f"By simulated points, to {FARTHEST_M:g} m (± 2 se)"
+        tables.append(PageTable.of(heading, columns(judged, by_points=True), judged.point_rows))
+    if judged.score_rows:
+        tables.append(PageTable.of("By the score of detections (± 2 se)", SCORE_COLUMNS, judged.score_rows))
+    first, *others = sentences(judged)
+    return MeasuredPage(
+        heading=title(judged).removesuffix(" (± 2 se)"),
+        lede=" ".join([first, *others[:1]]),
+        figure=_figure(judged),
+        caption="Share of the boxes of the other list by range, with two standard errors where there are enough blocks "
+        "of time.",
+        tables=tuple(tables),
+        sentences=tuple(others[1:]),
+    )
+
+
+def _figure(judged: JudgedList) -> str:
+    panels = []
+    has = "found" if judged.is_detections else "labelled"
+    for group in ("cars", "larger vehicles"):
+        rows = [row for row in judged.rows if row.group == group and (row.low, row.high) != (0.0, FARTHEST_M)]
+        if not rows:
+            continue
+        series = [Series(f"{has} within {NEAR_M:g} m", {_ends(row): row.found for row in rows})]
+        if judged.is_detections:
+            series.append(Series(f"{has} within {NEARER_M:g} m", {_ends(row): row.found_nearer for row in rows}))
+        if judged.sensor is not None:
+            series.append(Series("people should notice", {_ends(row): row.people for row in rows if row.people}))
+            series.append(Series("models expect", {_ends(row): row.detectors for row in rows if row.detectors}))
+        panels.append(Panel(group, tuple(_ends(row) for row in rows), tuple(series), in_percent=True))
+    return (
+        range_figure(panels, f"Share of cars and larger vehicles {has}, by range, beside what should be.")
+        if panels
+        else ""
+    )
+
+
+def _ends(row: AgreementRow) -> str:
+    return f"{row.low:g}-{row.high:g}"

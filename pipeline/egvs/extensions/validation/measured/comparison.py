@@ -8,8 +8,8 @@ expected with those of the sensor; count the measured points in each box; fit th
 (:mod:`egvs.extensions.validation.measured.return_fit`); compute what detectors and people are expected to find.
 
 Both counts leave out the lowest part of a box (:data:`egvs.extensions.validation.measured.box_points.BOTTOM_M`), where
-measured points are from the road, and so does the count on boxes beside them. Levels take the points that scores take: on boxes, as a run has them
-(:mod:`egvs.scoring.targets`).
+measured points are from the road, and so does the count on boxes beside them. Levels take the points that scores take:
+all on boxes (:mod:`egvs.scoring.targets`).
 
 Errors come from leaving out one object at a time, in all sweeps. They do not contain how far another place, another
 unit or another person differs.

@@ -17,7 +17,7 @@ COLOURS = ("q13", "q3", "q8", "q16", "q11", "q5")
 """Classes of the series, in the order of panels."""
 
 WIDTH = 760.0
-_LEFT, _RIGHT, _TOP, _HEIGHT, _BOTTOM, _GAP = 44.0, 12.0, 28.0, 210.0, 42.0, 30.0
+_LEFT, _RIGHT, _TOP, _HEIGHT, _BOTTOM, _GAP = 52.0, 10.0, 28.0, 210.0, 42.0, 22.0
 _LEGEND_LINE = 20.0
 _SHAPES = (
     '<circle {} r="4.6"/>',
@@ -104,7 +104,7 @@ def _panel(panel: Panel, names: Sequence[str], corner: tuple[float, float], widt
     def height(value: float) -> float:
         return base - _HEIGHT * min(max(value / most, 0.0), 1.0)
 
-    parts = [f'<text class="label" x="{left - 30:.1f}" y="{top - 9:.1f}">{escape(panel.title)}</text>']
+    parts = [f'<text class="label" x="{left - 42:.1f}" y="{top - 12:.1f}">{escape(panel.title)}</text>']
     for tick in round_values(0.0, most * factor, 5):
         y = height(tick.value / factor)
         parts.append(f'<path class="grid" d="M{left:.1f} {y:.1f}h{width:.1f}"/>')

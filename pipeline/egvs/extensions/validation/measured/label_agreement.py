@@ -25,7 +25,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -504,14 +503,18 @@ def _score_rows(pairs: Sequence[PlacedPair], sample: _Sample) -> Iterator[ScoreR
     if not cars.any():
         return
     for score in SCORES:
-        chosen = [np.zeros(0) if pair.judged.scores is None else pair.judged.scores for pair in pairs]
-        kept = [scores >= score for scores in chosen]
-        shares = []
-        for within_m in (NEAR_M, NEARER_M):
-            found = np.concatenate([pair.found(within_m, rows) for pair, rows in zip(pairs, kept, strict=True)])
-            shares.append(ratio_of_sums(found[cars].astype(np.float64), np.ones(int(cars.sum())), sample.blocks[cars]))
-        alone = sum(int((pair.alone(NEARER_M) & rows).sum()) for pair, rows in zip(pairs, kept, strict=True))
-        yield ScoreRow(score, sum(int(rows.sum()) for rows in kept), *shares, alone / len(pairs))
+        chosen = []
+        for pair in pairs:
+            scores = pair.judged.scores
+            chosen.append(np.zeros(0, dtype=np.bool_) if scores is None else scores >= score)
+
+        def share(within_m: float, chosen: Sequence[NDArray[np.bool_]] = chosen) -> Ratio:
+            found = np.concatenate([pair.found(within_m, rows) for pair, rows in zip(pairs, chosen, strict=True)])
+            return ratio_of_sums(found[cars].astype(np.float64), np.ones(int(cars.sum())), sample.blocks[cars])
+
+        alone = sum(int((pair.alone(NEARER_M) & rows).sum()) for pair, rows in zip(pairs, chosen, strict=True))
+        detections = sum(int(rows.sum()) for rows in chosen)
+        yield ScoreRow(score, detections, share(NEAR_M), share(NEARER_M), alone / len(pairs))
 
 
 def _area_notes(sample: _Sample) -> Iterator[str]:
