@@ -22,7 +22,7 @@ from egvs.extensions.validation.measured.yaw_conventions import MIN_RATIO
 NEAR_M = 3.0
 """Boxes of two lists within this distance in plan are of one road user."""
 
-MOST_SWEEPS = 200
+MOST_SWEEPS = 100
 """Pairs of sweeps that are used, evenly spaced."""
 
 FEWEST_TOGETHER = 30
@@ -37,7 +37,8 @@ _REFINEMENTS = 10
 _OTHER_TURN, _OTHER_SHIFT_M = math.radians(10.0), 6.0
 """A turn or a shift that differs by more is another answer."""
 
-_FINALISTS = 40
+_FINALISTS = 6
+"""Answers that are refined."""
 
 Centres = Sequence[tuple[FloatArray, FloatArray]]
 
@@ -112,16 +113,23 @@ def find_pose(centres: Centres, where: str) -> PlanPose:
 
 
 def _candidates(pairs: Centres) -> list[PlanPose]:
-    """Return the best shift of each turn, of the turns that bring most boxes together."""
-    found: list[tuple[int, PlanPose]] = []
+    """Return the best shifts of all turns that differ from one another, those that bring most boxes together first."""
+    ranked: list[tuple[int, PlanPose]] = []
     for turn_rad in np.arange(-math.pi, math.pi, _TURN_STEP).tolist():
         turn = PlanPose(turn_rad, 0.0, 0.0)
         away_m = np.concatenate([(second[None] - turn.apply(first)[:, None]).reshape(-1, 2) for first, second in pairs])
-        cells, counts = np.unique(np.round(away_m / _CELL_M).astype(np.int64), axis=0, return_counts=True)
+        cells = np.round(away_m / _CELL_M).astype(np.int64)
+        low, width = cells.min(axis=0), int(np.ptp(cells[:, 1])) + 1
+        numbers, counts = np.unique((cells[:, 0] - low[0]) * width + cells[:, 1] - low[1], return_counts=True)
         fullest = int(np.argmax(counts))
-        x_m, y_m = (cells[fullest] * _CELL_M).tolist()
-        found.append((int(counts[fullest]), PlanPose(turn_rad, x_m, y_m)))
-    return [pose for _, pose in sorted(found)[-_FINALISTS:]]
+        x, y = divmod(int(numbers[fullest]), width)
+        pose = PlanPose(turn_rad, (x + int(low[0])) * _CELL_M, (y + int(low[1])) * _CELL_M)
+        ranked.append((int(counts[fullest]), pose))
+    chosen: list[PlanPose] = []
+    for _, pose in sorted(ranked, reverse=True):
+        if all(_is_other(pose, other) for other in chosen) and len(chosen) < _FINALISTS:
+            chosen.append(pose)
+    return chosen
 
 
 def _refine(pairs: Centres, pose: PlanPose) -> tuple[int, PlanPose]:
@@ -141,7 +149,9 @@ def _refine(pairs: Centres, pose: PlanPose) -> tuple[int, PlanPose]:
         a, b = points - middle, others - other_middle
         turn_rad = math.atan2(float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()), float((a * b).sum()))
         shift_m = other_middle - PlanPose(turn_rad, 0.0, 0.0).apply(middle)
-        pose = PlanPose(turn_rad, float(shift_m[0]), float(shift_m[1]))
+        before, pose = pose, PlanPose(turn_rad, float(shift_m[0]), float(shift_m[1]))
+        if np.allclose(before, pose, rtol=0.0, atol=1e-4):
+            break
     return count_together(pairs, pose), pose
 
 
