@@ -103,11 +103,9 @@ def validate(
 
     of_sweeps = {"--sensor": sensor, "--site": site, "--yaw": yaw, "--columns": columns}
     if against or labels:
-        of_scenario = {"--plan": plan, "--plan-from": plan_from, "--keep": keep}
-        if against:
-            of_scenario["--detections"] = detections
-        for option, value in of_scenario.items():
-            if value:
+        unread = {"--plan": plan, "--plan-from": plan_from, "--keep": keep, "--detections": against and detections}
+        for option, unread_value in unread.items():
+            if unread_value:
                 raise InputError(option, "not available with measured sweeps", f"Omit {option}.")
         reading = sensor or [], site or [], yaw, columns
         if against:

@@ -24,6 +24,7 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,7 @@ CHANCE_SHIFT_S = 60.0
 
 PLACE_M = 10.0
 FEWEST_AT_PLACE = 20
-"""A place without labels, of this size and its neighbours, is left out if so many different objects were there."""
+"""A place of this size is left out if the list has no label there and beside it, where so many objects were."""
 
 SCORES = (0.0, 0.3, 0.5, 0.7)
 """Lowest scores of detections for which shares are printed."""
@@ -403,15 +404,25 @@ def _by_chance(pairs: Sequence[PlacedPair]) -> Iterator[FloatArray]:
 
 def _in_labelled_area(boxes: FloatArray, objects: IntArray, judged: Sequence[FloatArray]) -> NDArray[np.bool_]:
     """Return which boxes are at places where the judged list has boxes, or few objects ever were, (n,)."""
-    have_labels = set[tuple[int, int]]()
-    for x, y in np.unique(np.floor(np.concatenate(judged)[:, :2] / PLACE_M).astype(int), axis=0).tolist():
-        have_labels.update((x + i, y + j) for i in (-1, 0, 1) for j in (-1, 0, 1))
-    places = [(x, y) for x, y in np.floor(boxes[:, :2] / PLACE_M).astype(int).tolist()]
+    have_labels = set(_places(np.concatenate(judged)))
+    places = _places(boxes)
     at_place: dict[tuple[int, int], set[int]] = {}
     for place, number in zip(places, objects.tolist(), strict=True):
         at_place.setdefault(place, set()).add(number)
-    inside = [place in have_labels or len(at_place[place]) < FEWEST_AT_PLACE for place in places]
-    return np.array(inside, dtype=np.bool_)
+
+    @cache
+    def is_labelled(place: tuple[int, int]) -> bool:
+        around = [(place[0] + i, place[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        if not have_labels.isdisjoint(around):
+            return True
+        return len(set[int]().union(*(at_place.get(other, ()) for other in around))) < FEWEST_AT_PLACE
+
+    return np.array([is_labelled(place) for place in places], dtype=np.bool_)
+
+
+def _places(boxes: FloatArray) -> list[tuple[int, int]]:
+    """Return the place of each box, a square of :data:`PLACE_M`."""
+    return [(x, y) for x, y in np.floor(boxes[:, :2] / PLACE_M).astype(int).tolist()]
 
 
 def _frames(pairs: Sequence[PlacedPair]) -> list[TrafficFrame]:
