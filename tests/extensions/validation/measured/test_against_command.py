@@ -58,6 +58,7 @@ def test_without_labels_prints_repetition(folder: Path, run_egvs: Any) -> None:
         (("--against", "{}", "--labels", "{}", "--sensor", SENSOR, "--yaw", "z"), "--yaw: expected x-ccw, x-cw"),
         (("--against", "{}/none.pcd", "--labels", "{}", "--sensor", SENSOR), "none.pcd"),
         (("--against", "{}", "--sensor", SENSOR), "--out: only available with labels"),
+        (("--against", "{}/sweep0.json", "--labels", "{}", "--sensor", SENSOR), "sweep0.json"),
         (("--labels", "{}"), "--labels: expected two lists without sweeps, got one. Add the labels of another sensor"),
         (("--against", "{}", "--labels", "{}", "--sensor", "a", "--sensor", "b"), "--sensor: expected one name, got 2"),
         (("--against", "{}", "--labels", "{}", "--detections", "{}"), "--detections: not available with measured"),

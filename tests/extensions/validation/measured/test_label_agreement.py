@@ -82,6 +82,7 @@ def test_the_curve_is_found_by_points(judged: list[JudgedList]) -> None:
         assert sum(row.boxes for row in cars) == total(item).boxes
 
 
+@pytest.mark.slow
 def test_poses_are_those_of_the_files_or_found_by_boxes(tmp_path: Path, lists: Lists, judged: list[JudgedList]) -> None:
     """The sensors are 13.9 m apart, turned by 35 degrees, and 0.5 m apart in height."""
     paths = tuple(
@@ -97,6 +98,7 @@ def test_poses_are_those_of_the_files_or_found_by_boxes(tmp_path: Path, lists: L
         assert total(one).people.value == pytest.approx(total(other).people.value, abs=0.02)  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_tables_and_lists_in_one_frame(tmp_path: Path, lists: Lists, judged: list[JudgedList]) -> None:
     first, second = lists
     paths = two_sensors.write_table(tmp_path / "a.csv", first), two_sensors.write_table(tmp_path / "b.csv", second)
@@ -123,6 +125,7 @@ def detections_of(labels: list[Labels], seed: int = 5) -> tuple[list[Labels], li
     return detections, scores
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["kitti", "table", "openlabel"])
 def test_detections_take_the_place_of_a_second_list(tmp_path: Path, lists: Lists, kind: str) -> None:
     labels, columns = lists[0], COLUMNS if kind == "table" else None
@@ -201,6 +204,28 @@ def test_lists_of_other_instants_are_refused(tmp_path: Path, folders: tuple[Path
         compare_lists(AgreementRequest((folders[0], named)))
 
 
+def test_lists_without_road_users_in_reach_are_refused(tmp_path: Path, lists: Lists) -> None:
+    labels = lists[0][:10]
+    of = two_sensors.write_openlabel(tmp_path / "labels", labels, None)
+    unknown = [replace(item, classes=("OTHER",) * len(item.names)) for item in labels]
+    far = [replace(item, boxes=item.boxes + np.array([500.0, 0, 0, 0, 0, 0, 0])) for item in labels]
+    for name, boxes in (("unknown", unknown), ("far", far)):
+        path = two_sensors.write_openlabel(tmp_path / name, boxes, None)
+        with pytest.raises(InputError, match=rf"{name}: expected vehicles or people within 120 m.*got none"):
+            compare_lists(AgreementRequest((path,), of))
+
+
+def test_a_detector_that_finds_nothing_has_no_labelled_area(tmp_path: Path, lists: Lists) -> None:
+    labels = lists[0]
+    nothing = [replace(item, names=(), classes=(), boxes=np.empty((0, 7))) for item in labels]
+    of = two_sensors.write_kitti(tmp_path / "labels", labels)
+    (result,) = compare_lists(AgreementRequest((of,), two_sensors.write_kitti(tmp_path / "none", nothing)))
+    cars = sum(item.classes.count("CAR") for item in labels)
+    assert total(result).found.value == 0.0 and sum(row.boxes for row in result.rows if row.group == "cars") >= cars
+    assert any("the frames of the lists may differ" in note for note in result.notes)
+
+
+@pytest.mark.slow
 def test_frames_that_do_not_fit_are_refused() -> None:
     """Boxes that have nothing to do with one another."""
     rng = np.random.default_rng(1)

@@ -93,8 +93,6 @@ def sentences(judged: JudgedList) -> Iterator[str]:
         if cars.people is not None and cars.difference is not None:
             text += f"; people should notice {share_text(cars.people)}: {difference_text(cars.difference)} points"
         yield f"{text}."
-        if judged.is_detections and not cars.found.value:
-            yield "No detection is near any car: they may be in another frame than the labels."
     if judged.losses is not None:
         yield (
             f"Points are simulated on boxes, with losses: rated range {judged.losses.rated_range_m:g} m at "
@@ -107,7 +105,8 @@ def print_agreement(results: Sequence[JudgedList]) -> None:
     """Print tables and sentences of each judged list."""
     for number, judged in enumerate(results):
         print_sentences([*([""] if number else []), title(judged)])
-        print_table(columns(judged), judged.rows, file_width=_FILE_WIDTH)
+        if judged.rows:
+            print_table(columns(judged), judged.rows, file_width=_FILE_WIDTH)
         if judged.point_rows:
             print_sentences(["", f"The same by simulated points, to {FARTHEST_M:g} m (± 2 se)"])
             print_table(columns(judged, by_points=True), judged.point_rows, file_width=_FILE_WIDTH)
@@ -129,7 +128,9 @@ def write_agreement(results: Sequence[JudgedList], folder: Path, scenario: Scena
 
 def to_page(judged: JudgedList) -> MeasuredPage:
     """Return the part of the page on one judged list."""
-    tables = [PageTable.of("By range (± 2 se)", columns(judged), judged.rows)]
+    tables = []
+    if judged.rows:
+        tables.append(PageTable.of("By range (± 2 se)", columns(judged), judged.rows))
     if judged.point_rows:
         heading = f"By simulated points, to {FARTHEST_M:g} m (± 2 se)"
         tables.append(PageTable.of(heading, columns(judged, by_points=True), judged.point_rows))

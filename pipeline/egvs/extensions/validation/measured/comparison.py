@@ -242,7 +242,7 @@ def compare_labelled(request: ComparisonRequest, scenario: Scenario | None = Non
         If a file cannot be read, labels and sweeps do not belong together, the sensor or the site is unknown, or the
         convention of headings is not clear.
     """
-    sweeps = read_sweeps(sweep_labels.list_files(request.sweeps, *_SWEEP_KINDS), request.recording)
+    sweeps = _read_sweeps(request)
     labels = read_labels(request.labels, LabelOptions(request.columns or {}))
     pairs, notes = match_labels(sweeps, labels)
     convention = None
@@ -278,9 +278,17 @@ def compare_labelled(request: ComparisonRequest, scenario: Scenario | None = Non
 
 def compare_unlabelled(request: ComparisonRequest, scenario: Scenario | None = None) -> Repetition:
     """Return which returns of several sweeps of one place repeat; parameters and errors as :func:`compare_labelled`."""
-    sweeps = read_sweeps(sweep_labels.list_files(request.sweeps, *_SWEEP_KINDS), request.recording)
+    sweeps = _read_sweeps(request)
     sensor = sensor_site.find_sensor(request.sensor, scenario)
     return measure_repetition(sensor_site.on_ground_plane(sensor, sweeps), sweeps)
+
+
+def _read_sweeps(request: ComparisonRequest) -> list[Sweep]:
+    sweeps = read_sweeps(sweep_labels.list_files(request.sweeps, *_SWEEP_KINDS), request.recording)
+    if not sweeps:
+        hint = "Give point clouds (PCD, PLY, LAS, CSV, E57, .bin, .npz) or recordings of ROS."
+        raise InputError(request.sweeps[0], "expected sweeps, got none", hint)
+    return sweeps
 
 
 def _find_site(request: ComparisonRequest, scenario: Scenario | None, sweeps: Sequence[Sweep]) -> SensorSite:

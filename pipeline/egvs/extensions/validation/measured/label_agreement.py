@@ -13,7 +13,7 @@ noticed with the curves of :mod:`egvs.scoring.noticed` and with the models of de
 Vehicles are found by vehicles, people and bicycles by people and bicycles, all by boxes of no known class. Some boxes
 are found by chance, in queues: the share that stands in the list 60 s later says how many. Places where the judged list
 never has a box of a road user, although others have 20 different ones there, are not in its labelled area, and are left
-out.
+out; a detector has none.
 
 Errors come from leaving out 20 s at a time, or, of shorter recordings, one object at a time.
 """
@@ -219,11 +219,19 @@ def compare_lists(request: AgreementRequest, scenario: Scenario | None = None) -
         (labels,) = (_read_list(request, number, scenario) for number in range(len(request.labels)))
         items = read_labels((request.detections,), LabelOptions(request.columns or {}))
         detections = replace(labels, path=request.detections, labels=_in_one_convention(request, items))
-        return [_judge(detections, [labels], request, scenario, is_detections=True)]
+        return _with_boxes([_judge(detections, [labels], request, scenario, is_detections=True)], request)
     lists = [_read_list(request, number, scenario) for number in range(len(request.labels))]
     judged = []
     for number, item in enumerate(lists):
         judged.append(_judge(item, [*lists[:number], *lists[number + 1 :]], request, scenario))
+    return _with_boxes(judged, request)
+
+
+def _with_boxes(judged: list[JudgedList], request: AgreementRequest) -> list[JudgedList]:
+    """Return the results; InputError if no box is of a known class and in reach."""
+    if not any(item.rows for item in judged):
+        problem = f"expected vehicles or people within {RANGES_M[-1][1]} m of the other sensor, got none"
+        raise InputError(request.labels[0], problem, "Check classes, units (metres) and frames of the labels.")
     return judged
 
 
@@ -305,7 +313,11 @@ def _judge(
         pairs += placed
         names += [f"{number} {name}" for pair in placed for name in pair.other.names]
     model = None if judged.site is None else return_model(judged.site, scenario)
-    sample, block_note = _sample(judged, pairs, names, model, has_levels=judged.site is not None)
+    sample, block_note = _sample(judged, pairs, names, model)
+    if is_detections:  # a detector has no labelled area
+        sample = replace(sample, used=np.ones(len(sample.used), dtype=np.bool_))
+    if not sample.found.any():
+        notes.append(f"No box is within {NEAR_M:g} m of any of the others: the frames of the lists may differ.")
     notes += [*block_note, *_area_notes(sample), *_size_notes(sample, pairs)]
     if request.yaw is None and judged.site is not None:
         notes += _yaw_notes(judged.site, pairs, model)
@@ -334,8 +346,6 @@ def _sample(
     pairs: Sequence[PlacedPair],
     names: Sequence[str],
     model: ReturnModel | None,
-    *,
-    has_levels: bool,
 ) -> tuple[_Sample, list[str]]:
     sizes = [len(pair.boxes) for pair in pairs]
     boxes = np.concatenate([pair.boxes for pair in pairs])
@@ -344,7 +354,7 @@ def _sample(
     blocks, notes = _blocks(pairs)
     unknown = np.full(len(boxes), np.nan)
     points, people, detectors = unknown, unknown, unknown
-    if has_levels and judged.site is not None:
+    if judged.site is not None:
         points, people, detectors = _levels(judged.site, pairs, model)
     by_box = np.repeat(blocks, sizes)
     if len(np.unique(by_box)) < FEW_OBJECTS:

@@ -15,6 +15,7 @@ import numpy as np
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.wording import number_of
 from egvs.formats.sweep_files import Sweep
 from egvs.formats.sweep_labels import VCLASSES, SweepLabels
 from egvs.scenario.model import Scenario
@@ -120,7 +121,7 @@ def pose_above_boxes(labels: Sequence[SweepLabels]) -> tuple[Pose, str]:
     normal, height_m = _plane_of_bottoms(boxes[:, :3] - 0.5 * boxes[:, 5:6] * _UP)
     pitch_deg, roll_deg = np.degrees([np.arcsin(normal[0]), np.arctan2(normal[1], normal[2])]).tolist()
     sentence = (
-        f"the lower faces of {len(boxes):,} boxes are {height_m:.2f} m below the sensor "
+        f"the lower faces of {number_of(len(boxes), 'box', 'boxes')} are {height_m:.2f} m below the sensor "
         f"(pitch {pitch_deg:.2f}, roll {roll_deg:.2f} degrees); nothing but boxes hides vehicles"
     )
     return Pose(0.0, 0.0, height_m, 0.0, pitch_deg, roll_deg), sentence
