@@ -63,6 +63,23 @@ class LabelOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class SensorPose:
+    """Pose of a sensor in a frame that sensors share: p_shared = rotation p + translation.
+
+    Attributes
+    ----------
+    frame
+        Name of the shared frame.
+    rotation, translation_m
+        (3, 3) and (3,) float64.
+    """
+
+    frame: str
+    rotation: FloatArray
+    translation_m: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class SweepLabels:
     """The labelled boxes of one sweep.
 
@@ -85,6 +102,10 @@ class SweepLabels:
         Whether an object has one name in all sweeps.
     states_yaw
         Whether the format says where headings count from, and in which direction.
+    scores
+        Score of each box by a detector, (n,) float64; None for labels of people.
+    pose
+        Pose of the sensor in a frame that it shares with others, if the file has one.
     """
 
     file: Path
@@ -95,6 +116,8 @@ class SweepLabels:
     time_s: float = math.nan
     has_tracks: bool = True
     states_yaw: bool = True
+    scores: FloatArray | None = None
+    pose: SensorPose | None = None
 
     def __len__(self) -> int:
         """Number of boxes."""
@@ -117,6 +140,12 @@ def label_class(text: str) -> str:
     name = re.sub(r"[^a-z]", "", text.lower())
     name = _SYNONYMS.get(name, name)
     return name if name in VCLASSES else "other"
+
+
+def scores_or_none(scores: Sequence[float]) -> FloatArray | None:
+    """Return the scores of all boxes of a file, (n,) float64; None unless each has one."""
+    array = np.array(scores, dtype=np.float64)
+    return array if len(array) and np.isfinite(array).all() else None
 
 
 def sweep_name(path: PurePath | str) -> str:
@@ -163,22 +192,25 @@ def read_labels(paths: Sequence[str | Path], options: LabelOptions | None = None
 def list_files(paths: Sequence[str | Path], *kinds: str) -> list[Path]:
     """Return files as they are given, and the files of folders, by name, that may be of one of some kinds.
 
-    A folder that is itself of a format, as a recording of ROS 2, stays as it is.
+    A folder that is itself of a format, as a recording of ROS 2, stays as it is. Of a folder without such files, those
+    in its folders count.
     """
     listed: list[Path] = []
     for path in map(Path, paths):
         if not path.is_dir() or (path / "metadata.yaml").is_file():
             listed.append(path)
             continue
-        candidates = [reader for kind in kinds for reader in readers.list_readers(kind)]
-        for file in sorted(path.iterdir()):
-            if not file.is_file() or file.name.startswith("."):
-                continue
-            head = readers.read_head(file)
-            plain = file.with_suffix("") if file.suffix.lower() == ".gz" else file
-            if any(reader.may_open(named, head) for reader in candidates for named in (file, plain)):
-                listed.append(file)
+        entries = [entry for entry in sorted(path.iterdir()) if not entry.name.startswith(".")]
+        inside = [file for file in entries if file.is_file() and _is_of_kinds(file, kinds)]
+        listed += inside or list_files([entry for entry in entries if entry.is_dir()], *kinds)
     return listed
+
+
+def _is_of_kinds(file: Path, kinds: Sequence[str]) -> bool:
+    head = readers.read_head(file)
+    plain = file.with_suffix("") if file.suffix.lower() == ".gz" else file
+    candidates = (reader for kind in kinds for reader in readers.list_readers(kind))
+    return any(reader.may_open(named, head) for reader in candidates for named in (file, plain))
 
 
 def match_labels(

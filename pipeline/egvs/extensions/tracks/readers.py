@@ -26,7 +26,7 @@ READERS = (
     Reader("ASAM OSI", "tracks", f"{_FORMATS}.osi", suffixes=(".osi",), head=rb"\A\x89MCAP0\r\n"),
     Reader("pNEUMA trajectories", "tracks", f"{_FORMATS}.pneuma", head=rb"(?i)\A[^\n]*traveled_d"),
     Reader("SinD tracks", "tracks", f"{_FORMATS}.sind", head=rb"(?i)\A[^\n]*agent_type"),
-    Reader("DAIR-V2X or V2X-Seq labels", "labels", f"{_FORMATS}.dair_v2x", head=rb'"3d_location"'),
+    Reader("DAIR-V2X or V2X-Seq labels", "labels", f"{_FORMATS}.dair_v2x", head=rb'"3d_location"|\A\s*\[\s*\]'),
     Reader("OpenLABEL", "labels", f"{_FORMATS}.openlabel", head=rb'"openlabel"'),
     Reader("V2X-Seq trajectory forecasting", "tracks", f"{_FORMATS}.v2x_seq_tfd", head=rb"(?i)\A[^\n]*intersect_id"),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,6 +11,12 @@ from egvs.cli import options, sources
 from egvs.cli.commands import Command
 from egvs.cli.options import Jobs, Out, ScenarioPath, Set
 from egvs.core.errors import InputError, MissingBackendError
+
+if TYPE_CHECKING:
+    from egvs.scenario.model import Scenario
+
+_Reading = tuple[list[str], list[str], str | None, str | None]
+"""Sensors, sites, convention of headings, and columns of measured sweeps or labels."""
 
 DEFAULT_FRAMES = 250
 """Frames of a validation or a dataset."""
@@ -45,7 +51,11 @@ def validate(
     ] = "points,cluster",
     detections: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="KITTI results of other detectors: DIR/SITE/DETECTOR/FRAME.txt."),
+        typer.Option(
+            metavar="PATH",
+            help="KITTI results of other detectors: DIR/SITE/DETECTOR/FRAME.txt. With --labels: detections in the "
+            "labelled sweeps.",
+        ),
     ] = None,
     keep: Annotated[
         bool, typer.Option("--keep", help="Also write ground truth and detections as KITTI labels and results.")
@@ -65,11 +75,19 @@ def validate(
         typer.Option(metavar="SWEEPS", help="Hold measured sweeps against the simulation: files or a folder."),
     ] = None,
     labels: Annotated[
-        list[Path] | None, typer.Option(metavar="LABELS", help="Labelled boxes of the sweeps: files or a folder.")
+        list[Path] | None,
+        typer.Option(
+            metavar="LABELS",
+            help="Labelled boxes of the sweeps: a file or a folder. Without --against, one of each sensor of a place: "
+            "what does one list have of the other?",
+        ),
     ] = None,
-    sensor: Annotated[str | None, typer.Option(metavar="NAME", help="Sensor of the sweeps.")] = None,
+    sensor: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Sensor of the sweeps; of several lists, one for each.")
+    ] = None,
     site: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Site of the scenario where the sensor stands.")
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Site of the scenario where the sensor stands; one for each list."),
     ] = None,
     yaw: Annotated[
         str | None,
@@ -83,14 +101,21 @@ def validate(
     """Simulate detection from each site, and test which score predicts it; or validate a plan, or measured sweeps."""
     from egvs.cli.console import ProgressDisplay
 
-    of_sweeps = {"--labels": labels, "--sensor": sensor, "--site": site, "--yaw": yaw, "--columns": columns}
-    if against:
-        files = tuple(against), tuple(labels or ())
-        _validate_against(scenario, set_, out, files, sensor, site, yaw, columns, detector)
+    of_sweeps = {"--sensor": sensor, "--site": site, "--yaw": yaw, "--columns": columns}
+    if against or labels:
+        unread = {"--plan": plan, "--plan-from": plan_from, "--keep": keep, "--detections": against and detections}
+        for option, unread_value in unread.items():
+            if unread_value:
+                raise InputError(option, "not available with measured sweeps", f"Omit {option}.")
+        reading = sensor or [], site or [], yaw, columns
+        if against:
+            _validate_against(scenario, set_, out, (tuple(against), tuple(labels or ())), reading, detector)
+        else:
+            _compare_labels(scenario, set_, out, (tuple(labels or ()), detections), reading)
         return
     for option, value in of_sweeps.items():
         if value is not None:
-            raise InputError(option, "only available with --against", "Add --against SWEEPS.")
+            raise InputError(option, "only available with measured sweeps", "Add --against SWEEPS or --labels LABELS.")
     if scenario is None:
         raise InputError("SCENARIO", "expected a scenario or a run, got none", "Name one; or use --against SWEEPS.")
     of_plan = plan or plan_from is not None
@@ -127,10 +152,7 @@ def _validate_against(
     set_: list[str] | None,
     out: Path | None,
     sweeps_and_labels: tuple[tuple[Path, ...], tuple[Path, ...]],
-    sensor: str | None,
-    site: str | None,
-    yaw: str | None,
-    columns: str | None,
+    reading: _Reading,
     detector: str,
 ) -> None:
     """Hold measured sweeps against the simulation, or without labels, against one another."""
@@ -138,21 +160,22 @@ def _validate_against(
     from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
     from egvs.extensions.validation.measured import tables
     from egvs.extensions.validation.measured.comparison import ComparisonRequest, compare_labelled, compare_unlabelled
-    from egvs.extensions.validation.measured.yaw_conventions import CONVENTIONS
-    from egvs.scenario.loading import load
 
     sweeps, labels = sweeps_and_labels
-    if scenario is None and set_:
-        raise InputError("--set", "expected a scenario, got none", "Name the scenario.")
-    if yaw is not None and yaw not in CONVENTIONS:
-        raise InputError("--yaw", f"expected {', '.join(CONVENTIONS)}, got {yaw!r}", "Omit it to find it.")
+    sensors, sites, yaw, columns = reading
+    for option, names in (("--sensor", sensors), ("--site", sites)):
+        if len(names) > 1:
+            raise InputError(option, f"expected one name, got {len(names)}", "Sweeps are of one sensor.")
+    loaded = _load_for_sweeps(scenario, set_, yaw)
     named = [name.strip() for name in detector.split(",") if name.strip()]
     detectors = tuple(name for name in dict.fromkeys(named) if name != POINT_COUNTS_NAME)
-    request = ComparisonRequest(sweeps, labels, sensor, site, yaw, columns=_column_names(columns), detectors=detectors)
-    loaded = None if scenario is None else load(scenario, set_ or ())
+    request = ComparisonRequest(
+        sweeps, labels, sensors[0] if sensors else None, sites[0] if sites else None, yaw,
+        columns=_column_names(columns), detectors=detectors,
+    )  # fmt: skip
     if not labels:
-        for option, value in (("--out", out), ("--site", site), ("--yaw", yaw), ("--columns", columns)):
-            if value is not None:
+        for option, value in (("--out", out), ("--site", sites), ("--yaw", yaw), ("--columns", columns)):
+            if value:
                 raise InputError(option, "only available with labels", f"Add --labels LABELS, or omit {option}.")
         with ProgressDisplay("validate"):
             repetition = compare_unlabelled(request, loaded)
@@ -162,8 +185,56 @@ def _validate_against(
         comparison = compare_labelled(request, loaded)
     tables.print_comparison(comparison)
     if out is not None:
-        for path in tables.write_comparison(comparison, out):
+        for path in tables.write_comparison(comparison, out, loaded):
             print(f"wrote {path}")
+
+
+def _compare_labels(
+    scenario: Path | None,
+    set_: list[str] | None,
+    out: Path | None,
+    labels_and_detections: tuple[tuple[Path, ...], Path | None],
+    reading: _Reading,
+) -> None:
+    """Compare lists of labels of one place, or detections with labels."""
+    from egvs.cli.console import ProgressDisplay
+    from egvs.extensions.validation.measured import agreement_tables
+    from egvs.extensions.validation.measured.label_agreement import AgreementRequest, compare_lists
+
+    labels, detections = labels_and_detections
+    sensors, sites, yaw, columns = reading
+    if detections is None and len(labels) < 2:
+        hint = "Add the labels of another sensor of the place, --detections DETECTIONS, or --against SWEEPS."
+        raise InputError("--labels", "expected two lists without sweeps, got one", hint)
+    if detections is not None and len(labels) > 1:
+        problem = f"expected the labels of one sensor with detections, got {len(labels)} lists"
+        raise InputError("--labels", problem, "Compare one list at a time.")
+    if len(sensors) not in (0, 1, len(labels)):
+        problem = f"expected one sensor for each of {len(labels)} lists, or one for all, got {len(sensors)}"
+        raise InputError("--sensor", problem, "Repeat --sensor in the order of the lists.")
+    if sites and (scenario is None or len(sites) != len(labels)):
+        problem = f"expected a scenario, and a site for each of {len(labels)} lists, got {len(sites)}"
+        raise InputError("--site", problem, "Repeat --site in the order of the lists.")
+    loaded = _load_for_sweeps(scenario, set_, yaw)
+    request = AgreementRequest(labels, detections, tuple(sensors), tuple(sites), yaw, _column_names(columns))
+    with ProgressDisplay("validate"):
+        results = compare_lists(request, loaded)
+    agreement_tables.print_agreement(results)
+    if out is not None:
+        for path in agreement_tables.write_agreement(results, out, loaded):
+            print(f"wrote {path}")
+
+
+def _load_for_sweeps(scenario: Path | None, set_: list[str] | None, yaw: str | None) -> Scenario | None:
+    """Return the scenario of measured sweeps, if one is named."""
+    from egvs.extensions.validation.measured.yaw_conventions import CONVENTIONS
+    from egvs.scenario.loading import load
+
+    if scenario is None and set_:
+        raise InputError("--set", "expected a scenario, got none", "Name the scenario.")
+    if yaw is not None and yaw not in CONVENTIONS:
+        raise InputError("--yaw", f"expected {', '.join(CONVENTIONS)}, got {yaw!r}", "Omit it to find it.")
+    return None if scenario is None else load(scenario, set_ or ())
 
 
 def _column_names(text: str | None) -> dict[str, str]:

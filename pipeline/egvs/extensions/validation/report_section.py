@@ -16,7 +16,7 @@ from egvs.artefacts.readers import Rows, read_study
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord, have_inputs
 from egvs.core.errors import Diagnostic, collect_warnings
-from egvs.extensions.validation.files import CHECKSUMS, CORRELATION, DETECTION, FIGURE
+from egvs.extensions.validation.files import CHECKSUMS, CORRELATION, DETECTION, FIGURE, MEASURED
 from egvs.report.extension_sections import SectionWarning
 from egvs.scenario.model import Scenario
 
@@ -167,6 +167,29 @@ def _site_detection(value: float, se: float, values: Sequence[float]) -> SiteDet
     return SiteDetection(value, known_se, 1 + sum(other > value for other in values))
 
 
+class MeasuredSection:
+    """The section on measured sweeps and labels; see :class:`egvs.report.extension_sections.ReportSection`."""
+
+    name = "measured"
+    files = (MEASURED.name,)
+    template = Path(__file__).parent / "templates" / "measured.html.j2"
+
+    def read(self, folder: RunFolder, scenario: Scenario, stages: Mapping[str, StageRecord]) -> list[Any] | None:
+        """Return the parts of the section; None if there are none of this run."""
+        del scenario
+        if not (folder / MEASURED.name).is_file():
+            return None
+        from egvs.results.command_entries import current_entries
+
+        entries = current_entries(folder / MEASURED.name, stages)
+        return [part for values in entries.values() for part in values["parts"]] or None
+
+    def warnings(self, values: list[Any]) -> Iterator[SectionWarning]:
+        """Yield none: one installed sensor does not contradict a ranking of sites."""
+        del values
+        yield from ()
+
+
 class DetectedSection:
     """The section, as :class:`egvs.report.extension_sections.ReportSection` describes it."""
 
@@ -188,3 +211,4 @@ class DetectedSection:
 
 
 SECTION = DetectedSection()
+MEASURED_SECTION = MeasuredSection()

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from egvs.core.errors import InputError
-from egvs.core.readers import HEAD_BYTES
+from egvs.core.readers import HEAD_BYTES, find_reader
 from egvs.extensions.tracks.formats import dair_v2x
 from egvs.extensions.tracks.model import TrackFrame
+from egvs.formats.sweep_labels import read_labels
 from tests.extensions.tracks.boxes import assert_same_boxes, moving_boxes
 from tests.extensions.tracks.writers_json import CLASSES, write_dair_v2x
 
@@ -140,8 +141,16 @@ def test_recognises_its_files(tmp_path: Path) -> None:
     path = data_set(tmp_path, [[label()]])
     for file in (path, tmp_path / "data_info.json"):
         assert dair_v2x.can_open(file, file.read_bytes()[:HEAD_BYTES])
-    for other in (b"", b"[]", b"{}", b"\xff[", b'{"3d_location": 1}'):
+    for other in (b"", b"{}", b"[1]", b"\xff[", b'{"3d_location": 1}'):
         assert not dair_v2x.can_open(path, other)
+
+
+def test_an_empty_list_is_a_sweep_without_labels_but_no_tracks(tmp_path: Path) -> None:
+    path = tmp_path / "000001.json"
+    path.write_text(" [ ]\n", encoding="utf-8")
+    (labels,) = read_labels([path])
+    assert (labels.sweep, len(labels)) == ("000001", 0)
+    assert find_reader("tracks", path) is None
 
 
 @pytest.mark.parametrize(

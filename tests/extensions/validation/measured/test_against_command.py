@@ -58,7 +58,12 @@ def test_without_labels_prints_repetition(folder: Path, run_egvs: Any) -> None:
         (("--against", "{}", "--labels", "{}", "--sensor", SENSOR, "--yaw", "z"), "--yaw: expected x-ccw, x-cw"),
         (("--against", "{}/none.pcd", "--labels", "{}", "--sensor", SENSOR), "none.pcd"),
         (("--against", "{}", "--sensor", SENSOR), "--out: only available with labels"),
-        (("--labels", "{}"), "--labels: only available with --against"),
+        (("--against", "{}/sweep0.json", "--labels", "{}", "--sensor", SENSOR), "sweep0.json"),
+        (("--labels", "{}"), "--labels: expected two lists without sweeps, got one. Add the labels of another sensor"),
+        (("--against", "{}", "--labels", "{}", "--sensor", "a", "--sensor", "b"), "--sensor: expected one name, got 2"),
+        (("--against", "{}", "--labels", "{}", "--detections", "{}"), "--detections: not available with measured"),
+        (("--labels", "{}", "--labels", "{}", "--plan"), "--plan: not available with measured sweeps"),
+        (("--sensor", SENSOR), "--sensor: only available with measured sweeps"),
         ((), "SCENARIO: expected a scenario or a run, got none"),
         (("--against", "{}", "--labels", "{}/sweep0.pcd", "--sensor", SENSOR), "sweep0.pcd: expected labels ("),
         (

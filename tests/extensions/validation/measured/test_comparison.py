@@ -109,7 +109,8 @@ def test_fitted_sensor_is_a_sensor(compared: Comparison) -> None:
 
 
 def test_levels_have_both_numbers(compared: Comparison) -> None:
-    (cars,) = compared.levels
+    cars, *by_range = compared.levels
+    assert cars.from_m is None and sum(row.boxes for row in by_range) == cars.boxes == 60
     assert cars.detectors["sensor"].value < cars.detectors["fitted"].value < cars.detectors["none"].value
     assert cars.people["sensor"].value < cars.people["none"].value
     assert 0.0 < cars.people["measured"].value < 1.0

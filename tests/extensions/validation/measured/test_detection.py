@@ -51,7 +51,8 @@ def test_simulated_copy_is_found_as_the_simulation(tmp_path: Path) -> None:
     sweeps = twin.make_twin(ReturnModel.of(CATALOGUE[SENSOR]), seed=4)
     labels = tuple(twin.write_openlabel(tmp_path, sweeps))
     request = ComparisonRequest(tuple(twin.write_pcd(tmp_path, sweeps)), labels, SENSOR, detectors=("cluster",))
-    (row,) = compare_labelled(request).detections
+    row, *by_range = compare_labelled(request).detections
+    assert sum(other.boxes for other in by_range) == row.boxes == 60
     assert (row.detector, row.group, row.boxes, row.objects) == ("cluster", "cars", 60, 60)
     assert row.expected is not None and 0.2 < row.expected.value < 0.95
     assert row.measured.value == pytest.approx(row.simulated.value, abs=0.15)

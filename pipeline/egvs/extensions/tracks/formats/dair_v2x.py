@@ -26,7 +26,7 @@ from egvs.core.wording import number_of
 from egvs.extensions.tracks.boxes import Box, BoxRows, ClassNames, Pose, is_rotation
 from egvs.extensions.tracks.formats.documents import Node, read_document
 from egvs.extensions.tracks.model import TrackFrame, Tracks
-from egvs.formats.sweep_labels import LabelOptions, SweepLabels, sweep_name
+from egvs.formats.sweep_labels import LabelOptions, SweepLabels, scores_or_none, sweep_name
 
 _INDEX_FILE = "data_info.json"
 _LABEL_FOLDER, _CALIBRATION_FOLDER = "virtuallidar", "virtuallidar_to_world"
@@ -49,9 +49,10 @@ class _Sweep(NamedTuple):
 
 
 def can_open(_path: Path, head: bytes) -> bool:
-    """Return whether a JSON list begins with a label, or with an entry of ``data_info.json``."""
-    is_list = head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")
-    return is_list and (b'"3d_location"' in head or b'"label_lidar_std_path"' in head)
+    """Return whether a JSON list is empty, or begins with a label or an entry of ``data_info.json``."""
+    text = head.removeprefix(b"\xef\xbb\xbf").strip()
+    is_empty = text[:1] + text[1:].lstrip() == b"[]"
+    return is_empty or (text.startswith(b"[") and (b'"3d_location"' in head or b'"label_lidar_std_path"' in head))
 
 
 def companions(path: Path) -> Sequence[Path]:
@@ -108,7 +109,7 @@ def read_labels(path: Path, _options: LabelOptions) -> list[SweepLabels]:
     Files of this form are written by many tools, with headings of different conventions.
     """
     classes = ClassNames(_CLASSES, _STATIC)
-    names, kinds, boxes = [], [], []
+    names, kinds, boxes, scores = [], [], [], []
     tracked = True
     for index, item in enumerate(read_document(path).elements()):
         cls = classes.convert(item.get("type").text())
@@ -119,12 +120,15 @@ def read_labels(path: Path, _options: LabelOptions) -> list[SweepLabels]:
         tracked &= is_tracked
         names.append(str(track.value)[:80] if track is not None and is_tracked else f"{sweep_name(path)}-{index}")
         kinds.append(cls)
+        score = item.find("score")
+        scores.append(math.nan if score is None else score.number())
         box = _box(item, Pose())
         boxes.append((box.x_m, box.y_m, box.z_m, box.length_m, box.width_m, box.height_m, box.yaw_rad))
     array = np.array(boxes, dtype=np.float64).reshape(-1, 7)
     labels = SweepLabels(
-        path, sweep_name(path), tuple(names), tuple(kinds), array, has_tracks=tracked, states_yaw=False
-    )
+        path, sweep_name(path), tuple(names), tuple(kinds), array,
+        has_tracks=tracked, states_yaw=False, scores=scores_or_none(scores),
+    )  # fmt: skip
     return [labels]
 
 

@@ -33,9 +33,10 @@ from egvs.extensions.tracks.boxes import Box, BoxRows, ClassNames, Pose, front_o
 from egvs.extensions.tracks.formats.documents import Node, read_document
 from egvs.extensions.tracks.formats.openlabel_poses import SystemPose, pose_in_station, pose_in_world
 from egvs.extensions.tracks.model import TrackFrame, Tracks
-from egvs.formats.sweep_labels import LabelOptions, SweepLabels, sweep_name
+from egvs.formats.sweep_labels import LabelOptions, SensorPose, SweepLabels, scores_or_none, sweep_name
 
 _SWEEP_NAME = re.compile(r"(\d{9,11})_(\d{1,9})_(.+)\.json(\.gz)?")
+_SCORE_NAMES = ("score", "confidence")
 _MAX_LENGTH_ERROR = 0.01
 """Of a quaternion."""
 
@@ -88,13 +89,17 @@ def read_labels(path: Path, _options: LabelOptions) -> list[SweepLabels]:
         properties = frame.find("frame_properties")
         time = None if properties is None else properties.find("timestamp")
         file = None if properties is None else properties.find("point_cloud_file_name")
-        names, kinds, boxes = [], [], []
+        names, kinds, boxes, scores, pose = [], [], [], [], None
         for name, item, cuboid, is_tumtraf in _cuboids(frame, Counter()):
             cls = classes.convert(_type_of(root, name, item, is_tumtraf))
             if cls is None:
                 continue
             system = cuboid.find("coordinate_system")
             _check_in_sensor(root, system)
+            if pose is None:
+                named = match[3] if system is None and match is not None else "" if system is None else system.text()
+                pose = _sensor_pose(root, properties, named, is_tumtraf)
+            scores.append(_score(cuboid))
             box = _box(cuboid.get("val"), Pose())
             names.append(name)
             kinds.append(cls)
@@ -104,8 +109,32 @@ def read_labels(path: Path, _options: LabelOptions) -> list[SweepLabels]:
             time_s = int(match[1]) + int(match[2]) * 1e-9
         sweep = sweep_name(path if file is None else file.text())
         array = np.array(boxes, dtype=np.float64).reshape(-1, 7)
-        labels.append(SweepLabels(path, sweep, tuple(names), tuple(kinds), array, time_s))
+        found = scores_or_none(scores)
+        labels.append(SweepLabels(path, sweep, tuple(names), tuple(kinds), array, time_s, scores=found, pose=pose))
     return labels
+
+
+def _sensor_pose(root: Node, properties: Node | None, system: str, is_tumtraf: bool) -> SensorPose | None:
+    """Return the pose of a sensor in the frame to which poses lead; None if the file has none that is possible."""
+    try:
+        outer = pose_in_station(root, system) if is_tumtraf else pose_in_world(root, properties, system)
+    except InputError:
+        return None
+    if outer.name == system:
+        return None
+    return SensorPose(outer.name, np.array(outer.pose.rotation), np.array(outer.pose.translation))
+
+
+def _score(cuboid: Node) -> float:
+    """Return the score that a detector gives a cuboid, a number among its attributes; NaN without one."""
+    attributes = cuboid.find("attributes")
+    numbers = None if attributes is None else attributes.find("num")
+    is_list = numbers is not None and isinstance(numbers.value, list)
+    for item in numbers.elements() if numbers is not None and is_list else ():
+        name = item.find("name") if isinstance(item.value, dict) else None
+        if name is not None and str(name.value).lower() in _SCORE_NAMES:
+            return item.get("val").number()
+    return math.nan
 
 
 def _check_in_sensor(root: Node, system: Node | None) -> None:

@@ -8,8 +8,8 @@ expected with those of the sensor; count the measured points in each box; fit th
 (:mod:`egvs.extensions.validation.measured.return_fit`); compute what detectors and people are expected to find.
 
 Both counts leave out the lowest part of a box (:data:`egvs.extensions.validation.measured.box_points.BOTTOM_M`), where
-measured points are from the road. Levels take the points that scores take: on boxes, as a run has them
-(:mod:`egvs.scoring.targets`).
+measured points are from the road, and so does the count on boxes beside them. Levels take the points that scores take:
+all on boxes (:mod:`egvs.scoring.targets`).
 
 Errors come from leaving out one object at a time, in all sweeps. They do not contain how far another place, another
 unit or another person differs.
@@ -78,7 +78,7 @@ class BoxPoints:
     simulated, expected
         Beams that meet the body first; returns of them that are expected with the losses of the sensor, (n,) float64.
     on_box
-        Points that scores count, with the losses of the sensor, (n,) float64; NaN where the box is no target.
+        The same as ``expected`` on the box instead of the body, as scores count, (n,) float64; NaN for no target.
     """
 
     sweep: IntArray
@@ -138,6 +138,8 @@ class LevelRow:
     ----------
     group
         Name of the group.
+    from_m, to_m
+        The ranges; None for all.
     boxes, objects
         Their numbers.
     detectors, people
@@ -146,6 +148,8 @@ class LevelRow:
     """
 
     group: str
+    from_m: int | None
+    to_m: int | None
     boxes: int
     objects: int
     detectors: dict[str, Ratio]
@@ -238,7 +242,7 @@ def compare_labelled(request: ComparisonRequest, scenario: Scenario | None = Non
         If a file cannot be read, labels and sweeps do not belong together, the sensor or the site is unknown, or the
         convention of headings is not clear.
     """
-    sweeps = read_sweeps(sweep_labels.list_files(request.sweeps, *_SWEEP_KINDS), request.recording)
+    sweeps = _read_sweeps(request)
     labels = read_labels(request.labels, LabelOptions(request.columns or {}))
     pairs, notes = match_labels(sweeps, labels)
     convention = None
@@ -251,11 +255,11 @@ def compare_labelled(request: ComparisonRequest, scenario: Scenario | None = Non
         raise InputError(request.labels[0], "expected boxes of road users, got none", "Give labels with boxes.")
 
     site = _find_site(request, scenario, [sweep for sweep, _ in pairs])
-    model = _return_model(site, scenario)
+    model = return_model(site, scenario)
     frames = [site.frame(number, item) for number, (_, item) in enumerate(pairs)]
     hits = [BoxBeams.cast(site, frame) for frame in frames]
-    visible = _visible(site, frames, model)
-    points = _count_points(pairs, site, hits, visible, model)
+    visible = visible_boxes(site, frames, model)
+    points = _count_points(pairs, site, hits, model)
     fit = None if model is None else _fit_cars(points, hits, frames, model)
     levels = _levels(site, frames, points, model, fit)
     return Comparison(
@@ -274,9 +278,17 @@ def compare_labelled(request: ComparisonRequest, scenario: Scenario | None = Non
 
 def compare_unlabelled(request: ComparisonRequest, scenario: Scenario | None = None) -> Repetition:
     """Return which returns of several sweeps of one place repeat; parameters and errors as :func:`compare_labelled`."""
-    sweeps = read_sweeps(sweep_labels.list_files(request.sweeps, *_SWEEP_KINDS), request.recording)
+    sweeps = _read_sweeps(request)
     sensor = sensor_site.find_sensor(request.sensor, scenario)
     return measure_repetition(sensor_site.on_ground_plane(sensor, sweeps), sweeps)
+
+
+def _read_sweeps(request: ComparisonRequest) -> list[Sweep]:
+    sweeps = read_sweeps(sweep_labels.list_files(request.sweeps, *_SWEEP_KINDS), request.recording)
+    if not sweeps:
+        hint = "Give point clouds (PCD, PLY, LAS, CSV, E57, .bin, .npz) or recordings of ROS."
+        raise InputError(request.sweeps[0], "expected sweeps, got none", hint)
+    return sweeps
 
 
 def _find_site(request: ComparisonRequest, scenario: Scenario | None, sweeps: Sequence[Sweep]) -> SensorSite:
@@ -287,7 +299,7 @@ def _find_site(request: ComparisonRequest, scenario: Scenario | None, sweeps: Se
     return sensor_site.on_ground_plane(sensor_site.find_sensor(request.sensor, scenario), sweeps)
 
 
-def _return_model(site: SensorSite, scenario: Scenario | None) -> ReturnModel | None:
+def return_model(site: SensorSite, scenario: Scenario | None) -> ReturnModel | None:
     """Return the losses of the sensor, with the values that the scenario replaces; None without a rated range."""
     parameters = None
     if scenario is not None and scenario.effects.range_limit:
@@ -337,7 +349,7 @@ class BoxBeams:
         return model.probability(self.range_m, reflectivity[self.owner])
 
 
-def _visible(site: SensorSite, frames: Sequence[TrafficFrame], model: ReturnModel | None) -> TargetVisibility:
+def visible_boxes(site: SensorSite, frames: Sequence[TrafficFrame], model: ReturnModel | None) -> TargetVisibility:
     """Return what scores see of all boxes, people among them."""
     boxes = np.concatenate([frame.boxes for frame in frames])
     low = np.floor(boxes[:, :3].min(axis=0) - _GRID_MARGIN_M)
@@ -353,11 +365,17 @@ def _count_points(
     pairs: Sequence[tuple[Sweep, SweepLabels]],
     site: SensorSite,
     hits: Sequence[BoxBeams],
-    visible: TargetVisibility,
     model: ReturnModel | None,
 ) -> BoxPoints:
     names = tuple(name for _, item in pairs for name in item.names)
     boxes = np.concatenate([site.to_world(item.boxes) for _, item in pairs])
+    without_bottom = []
+    for number, (_, item) in enumerate(pairs):
+        frame = site.frame(number, item)
+        upper = frame.boxes + np.array([0.0, 0.0, 0.5 * BOTTOM_M, 0.0, 0.0, -BOTTOM_M, 0.0])
+        upper[:, 5] = np.maximum(upper[:, 5], BOTTOM_M)
+        without_bottom.append(replace(frame, boxes=upper))
+    visible = visible_boxes(site, without_bottom, model)
     on_box = np.full(len(names), np.nan)
     on_box[visible.record.row] = visible.points
     simulated, expected = [], []
@@ -400,22 +418,31 @@ def point_rows(points: BoxPoints) -> list[PointsRow]:
     names = [name for name in dict.fromkeys(points.classes) if name != "other"]
     rows = []
     for name in sorted(names, key=lambda name: -points.classes.count(name)):
-        of_class = points.of_class(name)
-        rows.append(_points_row(points, of_class, name, None))
-        for from_m, to_m in RANGES_M:
-            within = of_class & (points.range_m >= from_m) & (points.range_m < to_m)
-            if within.any() and within.sum() < of_class.sum():
-                rows.append(_points_row(points, within, name, (from_m, to_m)))
+        for ranges_m, boxes in _by_range(points, points.of_class(name)):
+            rows.append(_points_row(points, boxes, name, ranges_m))
     return rows
 
 
-def _points_row(points: BoxPoints, boxes: NDArray[np.bool_], name: str, ranges: tuple[int, int] | None) -> PointsRow:
+def _by_range(
+    points: BoxPoints, boxes: NDArray[np.bool_]
+) -> Iterator[tuple[tuple[int, int] | tuple[None, None], NDArray[np.bool_]]]:
+    """Yield all of some boxes (n,), and those in each of the ranges if they are in several."""
+    yield (None, None), boxes
+    for from_m, to_m in RANGES_M:
+        within = boxes & (points.range_m >= from_m) & (points.range_m < to_m)
+        if within.any() and within.sum() < boxes.sum():
+            yield (from_m, to_m), within
+
+
+def _points_row(
+    points: BoxPoints, boxes: NDArray[np.bool_], name: str, ranges_m: tuple[int, int] | tuple[None, None]
+) -> PointsRow:
     measured, simulated, expected = points.measured[boxes], points.simulated[boxes], points.expected[boxes]
     objects = points.object[boxes]
     return PointsRow(
         label=name,
-        from_m=None if ranges is None else ranges[0],
-        to_m=None if ranges is None else ranges[1],
+        from_m=ranges_m[0],
+        to_m=ranges_m[1],
         boxes=int(boxes.sum()),
         objects=len(np.unique(objects)),
         measured=int(measured.sum()),
@@ -441,32 +468,34 @@ def _levels(
     model: ReturnModel | None,
     fit: ReturnFit | None,
 ) -> list[LevelRow]:
-    views: dict[str, TargetVisibility] = {"none": _visible(site, frames, None)}
+    views: dict[str, TargetVisibility] = {"none": visible_boxes(site, frames, None)}
     if model is not None:
-        views["sensor"] = _visible(site, frames, model)
+        views["sensor"] = visible_boxes(site, frames, model)
     if model is not None and fit is not None:
         fitted = replace(model, rated_range_m=fit.rated_range_m, softness=fit.softness)
-        views["fitted"] = _visible(site, frames, fitted)
+        views["fitted"] = visible_boxes(site, frames, fitted)
     last = views["sensor" if model is not None else "none"]
     views["measured"] = replace(last, points=points.measured[last.record.row].astype(np.float64))
 
+    row_of_box = np.full(len(points), -1)
+    row_of_box[last.record.row] = np.arange(len(last))
     rows = []
     for name, classes in GROUPS.items():
-        members = np.array([points.classes[row] in classes for row in last.record.row.tolist()], dtype=np.bool_)
-        if not members.any():
-            continue
-        objects = points.object[last.record.row[members]]
+        of_group = np.isin(points.classes, classes)
+        for (from_m, to_m), boxes in _by_range(points, of_group) if of_group.any() else ():
+            members, objects = row_of_box[boxes], points.object[boxes]
 
-        def means(
-            chances: Callable[[TargetVisibility], FloatArray],
-            members: NDArray[np.bool_] = members,
-            objects: IntArray = objects,
-        ) -> dict[str, Ratio]:
-            ones = np.ones(int(members.sum()))
-            return {key: ratio_of_sums(chances(view)[members], ones, objects) for key, view in views.items()}
+            def means(
+                chances: Callable[[TargetVisibility], FloatArray],
+                members: IntArray = members,
+                objects: IntArray = objects,
+            ) -> dict[str, Ratio]:
+                ones = np.ones(len(members))
+                return {key: ratio_of_sums(chances(view)[members], ones, objects) for key, view in views.items()}
 
-        detectors = {} if name == "people" else means(detection_chances)
-        rows.append(LevelRow(name, int(members.sum()), len(np.unique(objects)), detectors, means(noticed_chances)))
+            detectors = {} if name == "people" else means(detection_chances)
+            people, count = means(noticed_chances), len(np.unique(objects))
+            rows.append(LevelRow(name, from_m, to_m, len(members), count, detectors, people))
     return rows
 
 
@@ -490,9 +519,9 @@ def _detections(
             chances = np.zeros(len(points))
             chances[visible.record.row] = chances_by_detector(visible, [detector.NAME])[0]
         for group in ("cars", "larger vehicles"):
-            members = np.isin(points.classes, GROUPS[group])
-            if members.any():
-                yield detection_row(detector.NAME, group, found, members, points.object, chances)
+            of_group = np.isin(points.classes, GROUPS[group])
+            for ranges_m, members in _by_range(points, of_group) if of_group.any() else ():
+                yield detection_row(detector.NAME, (group, *ranges_m), found, members, points.object, chances)
 
 
 def _few_objects(

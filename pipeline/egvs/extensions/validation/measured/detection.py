@@ -49,6 +49,8 @@ class DetectionRow:
     ----------
     detector, group
         Names.
+    from_m, to_m
+        Ranges of the boxes; None for all.
     boxes, objects
         Their numbers.
     expected
@@ -66,6 +68,8 @@ class DetectionRow:
 
     detector: str
     group: str
+    from_m: int | None
+    to_m: int | None
     boxes: int
     objects: int
     expected: Ratio | None
@@ -178,7 +182,7 @@ class DetectorTask:
 
 def detection_row(
     detector: str,
-    group: str,
+    group_and_ranges: tuple[str, int | None, int | None],
     found: tuple[Found, Found],
     members: NDArray[np.bool_],
     objects: IntArray,
@@ -188,8 +192,10 @@ def detection_row(
 
     Parameters
     ----------
-    detector, group
-        Names.
+    detector
+        Its name.
+    group_and_ranges
+        Name of the group, and the ranges of its boxes in metres; None for all.
     found
         What it finds in the measured and in the simulated sweeps.
     members
@@ -211,9 +217,12 @@ def detection_row(
         if len(ones) >= FEWEST_IN_BINS:
             for rows in np.array_split(np.argsort(chances[members], kind="stable"), 4):
                 bins.append((float(chances[members][rows].mean()), float(measured.fits[members][rows].mean())))
+    group, from_m, to_m = group_and_ranges
     return DetectionRow(
         detector=detector,
         group=group,
+        from_m=from_m,
+        to_m=to_m,
         boxes=len(ones),
         objects=len(np.unique(objects[members])),
         expected=None if chances is None else share(chances),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from egvs.extensions.validation import kitti
-from egvs.formats.sweep_labels import LabelOptions, SweepLabels, label_class, sweep_name
+from egvs.formats.sweep_labels import LabelOptions, SweepLabels, label_class, scores_or_none, sweep_name
 
 
 def read_labels(path: Path, _options: LabelOptions) -> list[SweepLabels]:
@@ -20,4 +20,5 @@ def read_labels(path: Path, _options: LabelOptions) -> list[SweepLabels]:
     objects = kitti.read_labels(path)
     names = tuple(f"{path.stem}-{line}" for line in objects.lines.tolist())
     classes = tuple(map(label_class, objects.names))
-    return [SweepLabels(path, sweep_name(path), names, classes, objects.boxes, has_tracks=False)]
+    scores = scores_or_none(objects.scores.tolist())
+    return [SweepLabels(path, sweep_name(path), names, classes, objects.boxes, has_tracks=False, scores=scores)]

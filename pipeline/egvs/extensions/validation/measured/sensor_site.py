@@ -15,6 +15,7 @@ import numpy as np
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.wording import number_of
 from egvs.formats.sweep_files import Sweep
 from egvs.formats.sweep_labels import VCLASSES, SweepLabels
 from egvs.scenario.model import Scenario
@@ -23,6 +24,13 @@ from egvs.sensors.sensor import Sensor, resolve_sensor, rotation_world_sensor, s
 from egvs.sensors.sites import Pose, Site
 
 _UP = np.array([0.0, 0.0, 1.0])
+
+_FEWEST_FOR_TILT = 10
+_LEAST_SPREAD_M = 5.0
+"""So many boxes, with this standard deviation across the direction of most of them, show the tilt of a sensor."""
+
+_OUTLIER, _BOTTOM_TOLERANCE_M = 4.0, 0.3
+_PLANE_STEPS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,17 +69,26 @@ class SensorSite:
 
     def to_world(self, boxes: FloatArray) -> FloatArray:
         """Return boxes of the sensor's frame (n, 7) in the world: upright, headed along the projection of their own."""
-        rotation = rotation_world_sensor(*self.pose.angles_deg)
-        front = np.column_stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), np.zeros(len(boxes))]) @ rotation.T
-        world = boxes.copy()
-        world[:, :3] = boxes[:, :3] @ rotation.T + np.asarray(self.pose.position_m)
-        world[:, 6] = np.arctan2(front[:, 1], front[:, 0])
-        return world
+        return boxes_in_world(self.pose, boxes)
 
     def frame(self, number: int, labels: SweepLabels) -> TrafficFrame:
         """Return the labelled boxes of a sweep as a frame of traffic."""
         kinds = tuple(VCLASSES[name] for name in labels.classes)
         return TrafficFrame(number, labels.names, kinds, self.to_world(labels.boxes), np.zeros(len(labels)))
+
+
+def boxes_in_world(pose: Pose, boxes: FloatArray) -> FloatArray:
+    """Return boxes of the frame of a sensor (n, 7) in the world, upright, headed along the projection of their own."""
+    return move_boxes(boxes, rotation_world_sensor(*pose.angles_deg), np.asarray(pose.position_m))
+
+
+def move_boxes(boxes: FloatArray, rotation: FloatArray, translation_m: FloatArray) -> FloatArray:
+    """Return boxes (n, 7) in another frame, p_to = rotation p + translation, with their sizes."""
+    front = np.column_stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), np.zeros(len(boxes))]) @ rotation.T
+    moved = boxes.copy()
+    moved[:, :3] = boxes[:, :3] @ rotation.T + translation_m
+    moved[:, 6] = np.arctan2(front[:, 1], front[:, 0])
+    return moved
 
 
 def on_ground_plane(sensor: Sensor, sweeps: Sequence[Sweep]) -> SensorSite:
@@ -96,6 +113,55 @@ def on_ground_plane(sensor: Sensor, sweeps: Sequence[Sweep]) -> SensorSite:
         weight=weight,
         assumptions=(_describe(plane), "Nothing else of the static world is known, so nothing else hides vehicles."),
     )
+
+
+def pose_above_boxes(labels: Sequence[SweepLabels]) -> tuple[Pose, str]:
+    """Return the pose of a sensor above the plane of the lower faces of its labelled boxes, and a sentence on it."""
+    boxes = np.concatenate([item.boxes for item in labels])
+    normal, height_m = _plane_of_bottoms(boxes[:, :3] - 0.5 * boxes[:, 5:6] * _UP)
+    pitch_deg, roll_deg = np.degrees([np.arcsin(normal[0]), np.arctan2(normal[1], normal[2])]).tolist()
+    sentence = (
+        f"the lower faces of {number_of(len(boxes), 'box', 'boxes')} are {height_m:.2f} m below the sensor "
+        f"(pitch {pitch_deg:.2f}, roll {roll_deg:.2f} degrees); nothing but boxes hides vehicles"
+    )
+    return Pose(0.0, 0.0, height_m, 0.0, pitch_deg, roll_deg), sentence
+
+
+def in_the_open(sensor: Sensor, pose: Pose, sentence: str) -> SensorSite:
+    """Return a site in a world without anything: not even the ground stops its beams."""
+    directions = sensor.directions(*pose.angles_deg)
+    count = len(directions)
+    return SensorSite(
+        name="labelled",
+        pose=pose,
+        sensor=sensor,
+        directions=directions,
+        range_m=np.full(count, float(sensor.range_m)),
+        beam=np.arange(count),
+        returned=np.zeros(count, dtype=np.bool_),
+        weight=np.ones(count) if sensor.beam_weight is None else sensor.beam_weight,
+        assumptions=(sentence,),
+    )
+
+
+def _plane_of_bottoms(bottoms_m: FloatArray) -> tuple[FloatArray, float]:
+    """Return the normal of the plane of points (n, 3), (3,), and the height of the origin above it.
+
+    A tilt is fitted where boxes are spread in both directions; otherwise the sensor counts as level.
+    """
+    used = np.ones(len(bottoms_m), dtype=np.bool_)
+    slopes = np.zeros(3)
+    for _ in range(_PLANE_STEPS):
+        x_y = bottoms_m[used, :2]
+        spread_m = np.linalg.svd(x_y - x_y.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(x_y)) if len(x_y) else 0.0
+        slopes = np.array([0.0, 0.0, np.median(bottoms_m[used, 2])])
+        if len(x_y) >= _FEWEST_FOR_TILT and spread_m >= _LEAST_SPREAD_M:
+            slopes = np.linalg.lstsq(np.column_stack([x_y, np.ones(len(x_y))]), bottoms_m[used, 2], rcond=None)[0]
+        distance_m = np.abs(bottoms_m[:, 2] - bottoms_m[:, :2] @ slopes[:2] - slopes[2])
+        used = distance_m <= max(_OUTLIER * float(np.median(distance_m)), _BOTTOM_TOLERANCE_M)
+    normal = np.array([-slopes[0], -slopes[1], 1.0])
+    length = float(np.sqrt((normal**2).sum()))
+    return normal / length, float(-slopes[2] / length)
 
 
 def _describe(plane: GroundPlane) -> str:

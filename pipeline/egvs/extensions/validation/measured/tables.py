@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from egvs.cli.console import Column, format_or_dash, print_sentences, print_table
 from egvs.clouds.simulation import REFLECTIVITY
 from egvs.core import files
 from egvs.core.wording import number_of
-from egvs.drawing import pages
 from egvs.extensions.validation.measured.comparison import Comparison, LevelRow, PointsRow
 from egvs.extensions.validation.measured.detection import NEARBY_M, DetectionRow
+from egvs.extensions.validation.measured.figures import Panel, Series, range_figure
+from egvs.extensions.validation.measured.pages import MeasuredPage, PageTable, write_pages
 from egvs.extensions.validation.measured.ratios import Ratio
 from egvs.extensions.validation.measured.repetition import Repetition, RepetitionRow
+from egvs.scenario.model import Scenario
 from egvs.sensors.sensor_table import format_sensor_table, sensor_keys
 
-JSON_FILE, PAGE_FILE, SENSOR_FILE = "against.json", "against.html", "sensor.toml"
-TEMPLATES = Path(__file__).parent.parent / "templates"
+SENSOR_FILE = "sensor.toml"
 
 LOSSES = {
     "none": "without losses",
@@ -30,8 +31,6 @@ LOSSES = {
 }
 
 _FILE_WIDTH = 150
-
-Row = TypeVar("Row")
 
 
 def ratio_text(ratio: Ratio) -> str:
@@ -49,7 +48,7 @@ def share_text(ratio: Ratio | None) -> str:
     return f"{share} %" if math.isnan(ratio.se) else f"{share} ± {200 * ratio.se:.0f} %"
 
 
-def range_text(row: PointsRow) -> str:
+def range_text(row: PointsRow | LevelRow | DetectionRow) -> str:
     """Return the ranges of a row."""
     return "all" if row.from_m is None else f"{row.from_m}-{row.to_m} m"
 
@@ -71,6 +70,7 @@ def level_columns(comparison: Comparison) -> list[Column[tuple[str, LevelRow]]]:
     """Return the columns of the table of levels; its rows are pairs of whose level it is, and a row."""
     columns: list[Column[tuple[str, LevelRow]]] = [
         Column("of", lambda row: row[1].group, "left"),
+        Column("range", lambda row: range_text(row[1]), "left"),
         Column("boxes", lambda row: f"{row[1].boxes:,}"),
         Column("level", lambda row: row[0], "left"),
     ]
@@ -99,6 +99,7 @@ def level_rows(comparison: Comparison) -> list[tuple[str, LevelRow]]:
 DETECTION_COLUMNS: list[Column[DetectionRow]] = [
     Column("detector", lambda row: row.detector, "left"),
     Column("of", lambda row: row.group, "left"),
+    Column("range", range_text, "left"),
     Column("boxes", lambda row: f"{row.boxes:,}"),
     Column("expected", lambda row: share_text(row.expected)),
     Column("simulated", lambda row: share_text(row.simulated)),
@@ -124,8 +125,8 @@ def sentences(comparison: Comparison) -> Iterator[str]:
     on_box, measured = points.on_box[cars].sum(), int(points.measured[cars].sum())
     if measured:
         yield (
-            f"Scores count points on boxes, not on bodies: with losses {on_box / measured:.2f} times the measured ones "
-            "on cars."
+            f"Scores count points on boxes, not on bodies: with losses, {on_box / measured:.2f} times the measured "
+            f"ones on cars, and {points.expected[cars].sum() / measured:.2f} times on bodies."
         )
     if comparison.convention is not None:
         name, held = comparison.convention
@@ -210,18 +211,12 @@ def print_comparison(comparison: Comparison) -> None:
         print_sentences(["", table.rstrip()])
 
 
-def write_comparison(comparison: Comparison, folder: Path) -> list[Path]:
+def write_comparison(comparison: Comparison, folder: Path, scenario: Scenario | None = None) -> list[Path]:
     """Write the results as JSON, the page, and the fitted sensor if there is one; return the files.
 
-    Raises
-    ------
-    InputError
-        If the folder cannot be written.
+    Errors and ``scenario`` as of :func:`egvs.extensions.validation.measured.pages.write_pages`.
     """
-    files.ensure_writable_folder(folder / JSON_FILE)
-    written = [folder / JSON_FILE, folder / PAGE_FILE]
-    files.write_text(written[0], files.to_json_text(to_json(comparison), indent=1) + "\n")
-    files.write_text(written[1], render_page(comparison))
+    written = write_pages([to_page(comparison)], to_json(comparison), comparison.site.sensor.name, folder, scenario)
     if table := fitted_table(comparison):
         written.append(folder / SENSOR_FILE)
         files.write_text(written[-1], table)
@@ -249,35 +244,74 @@ def to_json(comparison: Comparison) -> dict[str, Any]:
         "notes": list(sentences(comparison)),
         "boxes": [dict(zip(keys, box, strict=True)) for box in boxes],
     }
-    cleaned: dict[str, Any] = _without_nan(values)
+    cleaned: dict[str, Any] = without_nan(values)
     return cleaned
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
+    """Return JSON values with null for numbers that are not finite."""
     if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
+        return {key: without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
+        return [without_nan(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def render_page(comparison: Comparison) -> str:
-    """Return the page, HTML text."""
+def to_page(comparison: Comparison) -> MeasuredPage:
+    """Return the page."""
     levels = level_columns(comparison)
     tables = [
-        ("Points on vehicles (± 2 se)", _cells(POINT_COLUMNS, comparison.rows)),
-        ("What should be found of them (± 2 se)", _cells(levels, level_rows(comparison))),
+        PageTable.of("Points on vehicles (± 2 se)", POINT_COLUMNS, comparison.rows),
+        PageTable.of("What should be found of them (± 2 se)", levels, level_rows(comparison)),
     ]
     if comparison.detections:
         title = "What detectors find, sweep by sweep (boxes that overlap by more than 0.7; ± 2 se)"
-        tables.append((title, _cells(DETECTION_COLUMNS, comparison.detections)))
-    return pages.render(
-        pages.page_environment(TEMPLATES), "against.html.j2",
-        sensor=comparison.site.sensor.name, boxes=len(comparison.points), sweeps=comparison.sweeps, tables=tables,
-        sentences=list(sentences(comparison)), table=fitted_table(comparison),
-    )  # fmt: skip
+        tables.append(PageTable.of(title, DETECTION_COLUMNS, comparison.detections))
+    lede, *others = sentences(comparison)
+    return MeasuredPage(
+        heading="Simulated and measured points, and what should be found",
+        lede=lede,
+        figure=_figure(comparison),
+        caption="Cars by range, with two standard errors where there are enough of them. Left: simulated points over "
+        "measured ones. Right: what people and models of detectors should find with the losses of the sensor, and "
+        "what detectors find in the measured sweeps.",
+        tables=tuple(tables),
+        sentences=tuple(others),
+        sensor=fitted_table(comparison),
+    )
 
 
-def _cells(columns: Sequence[Column[Row]], rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Return the heads and the cells of a table."""
-    return [column.title for column in columns], [[column.text(row) for column in columns] for row in rows]
+def _figure(comparison: Comparison) -> str:
+    """Return the figure of cars by range; empty without cars at two ranges."""
+    cars = [row for row in comparison.rows if row.label == "car" and row.from_m is not None]
+    levels = [row for row in comparison.levels if row.group == "cars" and row.from_m is not None]
+    detections = [row for row in comparison.detections if row.group == "cars" and row.from_m is not None]
+    if not cars or not levels:
+        return ""
+    losses = "none" if comparison.model is None else "sensor"
+    points = [
+        Series("without losses", {_ends(row): row.without_losses for row in cars}),
+        Series("with losses", {_ends(row): row.with_losses for row in cars}),
+    ]
+    shares = [
+        Series("people should notice", {_ends(row): row.people[losses] for row in levels}),
+        Series("models expect", {_ends(row): row.detectors[losses] for row in levels}),
+    ]
+    for name in dict.fromkeys(row.detector for row in detections):
+        of_detector = [row for row in detections if row.detector == name]
+        shares.append(
+            Series(f"{name}, within {NEARBY_M:g} m", {_ends(row): row.measured_nearby for row in of_detector})
+        )
+        shares.append(Series(f"{name}, fitting box", {_ends(row): row.measured for row in of_detector}))
+    categories = tuple(_ends(row) for row in cars)
+    panels = [
+        Panel(
+            "simulated / measured points", categories, tuple(points[:1] if losses == "none" else points), reference=1.0
+        ),
+        Panel("share of the cars", categories, tuple(shares), in_percent=True),
+    ]
+    return range_figure(panels, "Simulated over measured points on cars by range, and shares of cars found by range.")
+
+
+def _ends(row: PointsRow | LevelRow | DetectionRow) -> str:
+    return f"{row.from_m}-{row.to_m}"

@@ -2,8 +2,9 @@
 
 A file that does not say where headings count from, and in which direction, is read in all four conventions. In the
 right one boxes lie on vehicles, in the others most lie across them. The best one is taken if it holds
-:data:`MIN_RATIO` times the points of the next; otherwise the file is refused. Conventions that give the same boxes,
-such as those of vehicles that all drive along x or y, count as one.
+:data:`MIN_RATIO` times the points of the next, and if at least :data:`FEWEST_BOXES` boxes hold other numbers of points
+in the two: single boxes that are a little misplaced favour any of them. Otherwise the file is refused. Conventions that
+give the same boxes, such as those of vehicles that all drive along x or y, count as one.
 """
 
 from __future__ import annotations
@@ -14,12 +15,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import FloatArray, IntArray
 from egvs.extensions.validation.measured.box_points import points_in_boxes
 from egvs.formats.sweep_files import Sweep
 from egvs.formats.sweep_labels import SweepLabels
 
 MIN_RATIO = 1.5
+
+FEWEST_BOXES = 5
+"""Fewest boxes that tell the best convention from the next."""
 
 SAME_RAD = math.radians(1.0)
 """Boxes whose directions differ by at most this are the same; front and rear are not told apart."""
@@ -55,21 +59,27 @@ def find_convention(pairs: Pairs) -> tuple[str, dict[str, int]]:
     InputError
         If no convention is clearly the best.
     """
-    held: dict[str, int] = {}
+    by_box: dict[str, IntArray] = {}
     directions: list[FloatArray] = []
     for name, convert in CONVENTIONS.items():
         yaw = np.concatenate([convert(labels.boxes[:, 6]) for _, labels in pairs])
         if any(_are_same(yaw, other) for other in directions):
             continue
         directions.append(yaw)
-        held[name] = sum(
-            int(points_in_boxes(sweep.points_m, in_convention(labels, name).boxes).sum()) for sweep, labels in pairs
+        counts = [points_in_boxes(sweep.points_m, in_convention(labels, name).boxes) for sweep, labels in pairs]
+        by_box[name] = np.concatenate(counts)
+    held = {name: int(counts.sum()) for name, counts in by_box.items()}
+    best, *others = sorted(held, key=lambda name: -held[name])
+    text = ", ".join(f"{name} {count:,}" for name, count in held.items())
+    problem = ""
+    if not held[best] or (others and held[best] < MIN_RATIO * held[others[0]]):
+        problem = f"the convention of headings is not clear: points in boxes by convention: {text}"
+    elif others and (telling := np.count_nonzero(by_box[best] != by_box[others[0]])) < FEWEST_BOXES:
+        problem = (
+            f"the convention of headings is not clear: expected {FEWEST_BOXES} boxes that tell, got {telling}; points "
+            f"in boxes by convention: {text}"
         )
-    ranked = sorted(held, key=lambda name: -held[name])
-    best = ranked[0]
-    if (len(ranked) > 1 and held[best] < MIN_RATIO * held[ranked[1]]) or not held[best]:
-        counts = ", ".join(f"{name} {count:,}" for name, count in held.items())
-        problem = f"the convention of headings is not clear: points in boxes by convention: {counts}"
+    if problem:
         hint = f"State it: --yaw {best}. If boxes hold few points in all of them, labels are in another frame."
         raise InputError(pairs[0][1].file, problem, hint)
     return best, held
