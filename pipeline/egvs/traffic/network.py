@@ -368,7 +368,9 @@ def read_net_xml(path: Path, name: Path | None = None) -> Network:
 def no_internal_edges_error(where: object, path: Path) -> InputError:
     """Return the error for a network that was made without edges inside junctions."""
     problem = "the network has no edges inside its junctions (internal links), so vehicles would jump across them"
-    return InputError(where, problem, f"Make it again: netconvert -s {path.name} -o new.net.xml, and use new.net.xml.")
+    return InputError(
+        where, problem, f"Run netconvert -s {path.name} --no-internal-links false -o new.net.xml, and use it."
+    )
 
 
 @dataclass(frozen=True)
