@@ -383,7 +383,8 @@ def test_network_without_internal_links_is_rejected(crossing, tmp_path, signalis
     roads = network.read_net_xml(tmp_path / "net.net.xml")
     assert roads.lacks_internal_edges
     assert not network.read_net_xml(crossing / "net.net.xml").lacks_internal_edges
-    message = r"net\.net\.xml: the network has no edges inside its junctions .* netconvert -s net\.net\.xml --no-internal-links false -o new\.net"
+    command = r"netconvert -s net\.net\.xml --no-internal-links false -o new\.net"
+    message = rf"net\.net\.xml: the network has no edges inside its junctions .* {command}"
     if signalised:
         with pytest.raises(InputError, match=message):
             signals.read_signals(tmp_path / "net.net.xml", roads)
