@@ -56,12 +56,15 @@ def test_takes_junction_at_point_then_near_signals_then_the_nearest(
 ) -> None:
     summary = create(tmp_path, at_m)
     assert summary.junction.title == title
-    assert not any("No junction in the map has signals" in note for note in summary.notes)
+    assert not any("has signals" in note for note in summary.notes)
 
 
 def test_largest_junction_without_any_signals_has_a_note(tmp_path: Path) -> None:
     notes = create(tmp_path, None, signals=False).notes
-    assert "No junction in the map has signals; the one with the most incoming lanes was chosen." in notes
+    assert (
+        "No junction of three or more roads in the map has signals; the one with the most incoming lanes was chosen."
+        in notes
+    )
 
 
 def test_junction_without_signals_at_the_point_has_no_note(tmp_path: Path) -> None:
@@ -100,3 +103,77 @@ def test_poles_are_spread_over_the_arms_of_a_fork(tmp_path: Path) -> None:
         pole = Point(float(row["x_m"]), float(row["y_m"]))
         nearest[min(arms, key=lambda name: arms[name].distance(pole))] += 1
     assert nearest == {"West": 4, "North": 4, "South": 4}
+
+
+# ---- what a junction is
+
+CROSSING = {"highway": "traffic_signals", "crossing": "traffic_signals"}
+
+
+@pytest.mark.parametrize("distance_m", [150.0, 400.0])
+def test_signals_of_a_pedestrian_crossing_are_no_junction(tmp_path: Path, distance_m: float) -> None:
+    """The T-junction without signals is the junction, also where the crossing is too far away for its surroundings."""
+    nodes = {1: (-200.0, 0.0), 2: (0.0, 0.0), 4: (distance_m, 0.0), 5: (distance_m + 200, 0.0), 6: (distance_m, 200.0)}
+    osm = write_map(
+        tmp_path / "map.osm", nodes, [street("Main Street", 1, 2, 4, 5), street("Side Street", 4, 6)], {2: CROSSING}
+    )
+    summary = create_scenario(tmp_path / "out", osm, None)
+    assert summary.junction.title == "junction without signals of Main Street and Side Street"
+    assert (summary.junction.arms, summary.junction.lanes_in) == (3, 3)
+
+
+def test_carriageways_of_divided_roads_are_one_arm_each(tmp_path: Path) -> None:
+    """Two divided roads cross: eight one-way streets, four arms."""
+    nodes = {1: (-300.0, -6.0), 2: (300.0, -6.0), 3: (300.0, 6.0), 4: (-300.0, 6.0)}
+    nodes |= {5: (-6.0, 300.0), 6: (-6.0, -300.0), 7: (6.0, -300.0), 8: (6.0, 300.0)}
+    nodes |= {11: (-6.0, -6.0), 12: (6.0, -6.0), 13: (6.0, 6.0), 14: (-6.0, 6.0)}
+    one_way = {"oneway": "yes"}
+    ways = [
+        street("A Street", 1, 11, 12, 2, **one_way),
+        street("A Street", 3, 13, 14, 4, **one_way),
+        street("B Street", 5, 14, 11, 6, **one_way),
+        street("B Street", 7, 12, 13, 8, **one_way),
+    ]
+    signals = {node: {"highway": "traffic_signals"} for node in (11, 12, 13, 14)}
+    summary = create_scenario(tmp_path / "out", write_map(tmp_path / "map.osm", nodes, ways, signals), None)
+    assert summary.junction.title == SIGNALISED
+    assert (summary.junction.arms, summary.junction.lanes_in) == (4, 4)
+
+
+def test_road_that_becomes_divided_is_no_junction(tmp_path: Path) -> None:
+    nodes = {1: (-300.0, 0.0), 2: (0.0, 0.0), 3: (30.0, 6.0), 4: (300.0, 6.0), 5: (30.0, -6.0), 6: (300.0, -6.0)}
+    nodes |= {7: (-200.0, 0.0), 8: (-200.0, 150.0)}
+    ways = [
+        street("A Street", 1, 7, 2),
+        street("A Street", 2, 5, 6, oneway="yes"),
+        street("A Street", 4, 3, 2, oneway="yes"),
+        street("B Street", 7, 8),
+    ]
+    summary = create_scenario(tmp_path / "out", write_map(tmp_path / "map.osm", nodes, ways, None), None)
+    assert summary.junction.title == "junction without signals of A Street and B Street"
+    assert not summary.region.other_junctions
+
+
+def test_next_junctions_are_listed_with_the_option_that_chooses_them(tmp_path: Path) -> None:
+    summary = create(tmp_path, None)
+    (other,) = summary.region.other_junctions
+    title, _, at = other.removesuffix(")").partition(" (--at ")
+    assert title == PLAIN
+    lat_deg, lon_deg = map(float, at.split(","))
+    again = create_scenario(tmp_path / "other", tmp_path / "map.osm", (lat_deg, lon_deg))
+    assert again.junction.title == PLAIN
+    assert not again.region.other_junctions
+
+
+@pytest.mark.parametrize("access", [True, False])
+def test_network_with_at_most_one_end_has_traffic_through_the_junction(tmp_path: Path, access: bool) -> None:
+    """A block of streets with a cross in its middle: 4 approaches with 3 turns each, with or without an access road."""
+    nodes = {1: (0.0, 0.0), 2: (100.0, 0.0), 3: (-100.0, 0.0), 4: (0.0, 100.0), 5: (0.0, -100.0)}
+    nodes |= {6: (100.0, 100.0), 7: (-100.0, 100.0), 8: (-100.0, -100.0), 9: (100.0, -100.0), 10: (250.0, 100.0)}
+    ways = [street("East Street", 3, 1, 2), street("North Street", 4, 1, 5), street("Block", 6, 4, 7, 3, 8, 5, 9, 2, 6)]
+    if access:
+        ways.append(street("Access", 6, 10))
+    osm = write_map(tmp_path / "map.osm", nodes, ways, {1: {"highway": "traffic_signals"}})
+    summary = create_scenario(tmp_path / "out", osm, None)
+    assert len(summary.flows) == 12
+    assert not any("no street leads vehicles" in note for note in summary.notes)

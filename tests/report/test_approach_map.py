@@ -31,7 +31,7 @@ def test_labels_name_side_street_and_vehicles_per_hour(tmp_path: Path) -> None:
     flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
     network, streets = street_network.build_network(extract, SMALL, flags)
     (tmp_path / "network.net.xml").write_text(network)
-    junction = junctions.largest_junction(streets)
+    junction = junctions.largest_junctions(streets)[0]
     assert junction is not None
     labels = approach_map.approach_labels(COUNTS, tmp_path / "network.net.xml", junction.at_m)
     assert [label.lines for label in labels] == [

@@ -13,10 +13,12 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
+from egvs.creation import sumo_network
+from egvs.creation.map_parts import RoadOptions
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.signal_config import SignalPhaseConfig
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.stages import traffic
+from egvs.stages import check, traffic
 from egvs.traffic import directions, network, signal_descriptions, signal_plans, signals, sumo, sumo_folder
 from tests.stage_runner import run_stage
 from tests.traffic.helpers import netgenerate
@@ -369,3 +371,28 @@ def test_long_ids_are_shortened_and_still_accepted(tmp_path):
     twin = replace(long, id=f"{name}_2", nodes=(f"{name}_2",))
     with pytest.raises(InputError, match=rf"2 signals have this name: Mill Lane \({name}\), Mill Lane \({name}_2\)"):
         signal_plans.find_signal("cluster_1423165998_…", [long, twin], "x")
+
+
+@pytest.mark.parametrize("signalised", [True, False])
+def test_network_without_internal_links_is_rejected(crossing, tmp_path, signalised):
+    """Vehicles would jump across the junction, and signals cannot be read; the message says how to make it again."""
+    signals_of_it = [] if signalised else ["--tls.discard-loaded"]
+    sumo.run_netconvert(
+        ["-s", str(crossing / "net.net.xml"), "--no-internal-links", *signals_of_it], tmp_path, "net.net.xml"
+    )
+    roads = network.read_net_xml(tmp_path / "net.net.xml")
+    assert roads.lacks_internal_edges
+    assert not network.read_net_xml(crossing / "net.net.xml").lacks_internal_edges
+    command = r"netconvert -s net\.net\.xml --no-internal-links false -o new\.net"
+    message = rf"net\.net\.xml: the network has no edges inside its junctions .* {command}"
+    if signalised:
+        with pytest.raises(InputError, match=message):
+            signals.read_signals(tmp_path / "net.net.xml", roads)
+    with pytest.raises(InputError, match=message):
+        sumo_network.read_roads(tmp_path / "net.net.xml", RoadOptions())
+    report = check.check_scenario(scenario(tmp_path, {}))
+    (error,) = [finding for finding in report.errors if finding.rule == "traffic"]
+    assert re.search(message, str(error))
+
+    sumo.run_netconvert(["-s", "net.net.xml", "--no-internal-links", "false"], tmp_path, "new.net.xml")
+    assert not network.read_net_xml(tmp_path / "new.net.xml").lacks_internal_edges

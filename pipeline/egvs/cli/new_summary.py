@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from egvs.creation.static_objects import MapSummary
 
 _FILE_WIDTH = 160
+_MOST_NAMED = 3
 
 
 def print_new_scenario(scenario: NewScenario, map_notes: Sequence[str] = ()) -> None:
@@ -44,6 +45,8 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     width_m, depth_m = region.roi.size_m
     arms = f"{number_of(junction.arms, 'arm')}, {number_of(junction.lanes_in, 'incoming lane')}"
     yield "junction", f"{junction.title}: {arms}; {_position(scenario)}"
+    if region.other_junctions:
+        yield "", f"also in the map: {list_first(region.other_junctions, _MOST_NAMED, '; ')}"
     yield "region", f"{width_m:g} m x {depth_m:g} m x {region.height_m:g} m around the junction"
     yield "streets", describe_streets(scenario.streets)
     yield "traffic", scenario.traffic.describe()

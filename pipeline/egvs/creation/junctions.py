@@ -1,6 +1,6 @@
 r"""Choose a junction of a street network, its region of interest, poles along its kerbs, and flows through it.
 
-Steps: :func:`read_streets` turns a SUMO network into :class:`Streets`; :func:`largest_junction`, or
+Steps: :func:`read_streets` turns a SUMO network into :class:`Streets`; :func:`largest_junctions`, or
 :func:`choose_nearby` at a point; :func:`region_around` it; :func:`kerbside_poles` along the edge of the carriageway;
 :func:`assumed_flows` through the region.
 
@@ -46,7 +46,7 @@ from shapely.geometry import LineString, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY, FloatArray
-from egvs.creation import roundabouts
+from egvs.creation import arms, roundabouts
 from egvs.creation.roundabouts import Ring
 from egvs.formats.georeference import WorldFrame
 from egvs.scenario.traffic_config import CountConfig
@@ -120,7 +120,7 @@ class StreetJunction:
     lanes_in
         Number of incoming lanes for vehicles.
     arms
-        Number of neighbouring nodes that a street leads to.
+        Number of roads for cars that meet there (:mod:`egvs.creation.arms`).
     signalised
         Whether it has traffic lights.
     names
@@ -145,7 +145,7 @@ class StreetJunction:
 
     @property
     def is_crossing(self) -> bool:
-        """Whether at least three streets meet there."""
+        """Whether at least three roads for cars meet there."""
         return self.arms >= MIN_ARMS
 
     def distance_m(self, point_m: XY) -> float:
@@ -336,14 +336,14 @@ def _make_junction(node: road_network.Junction, roads: Sequence[Edge], lanes_for
     if len(corners_m) >= 3:
         area = shapely.make_valid(Polygon(corners_m))
 
-    neighbours = {end for road in roads for end in _ends(road)} - {node.id}
-    names = {html.unescape(road.name) for road in roads if road.name}  # netconvert escapes names twice
+    car_roads = [road for road in roads if road.lanes_for(CAR)]
+    names = {html.unescape(road.name) for road in car_roads or roads if road.name}  # netconvert escapes names twice
     return StreetJunction(
         node.id,
         node.at_m,
         area,
         lanes_in=sum(lane in lanes_for_vehicles for lane in node.incoming_lanes),
-        arms=len(neighbours),
+        arms=len(arms.group_arms((node.id,), node.at_m, car_roads)),
         signalised=node.type.startswith("traffic_light"),
         names=tuple(sorted(names)),
     )
@@ -355,14 +355,15 @@ def _make_roundabout(
     """Make one junction of the junctions on a ring."""
     roads = {road.id: road for node in ring.nodes for road in roads_at_node.get(node, [])}
     ring_lanes = sum(not lane.is_pavement for edge_id in ring.edges for lane in roads[edge_id].lanes)
-    arms = roundabouts.ring_arms(ring, list(roads.values()))
-    names = {html.unescape(edge.name) for arm in arms for edge in arm if edge.name}
+    car_roads = [road for road in roads.values() if road.lanes_for(CAR)]
+    ring_arms = roundabouts.ring_arms(ring, car_roads or list(roads.values()))
+    names = {html.unescape(edge.name) for arm in ring_arms for edge in arm if edge.name}
     return StreetJunction(
         f"roundabout_{'_'.join(ring.nodes)}",
         ring.middle_m,
         ring.area,
         lanes_in=sum(junction.lanes_in for junction in on_ring) - ring_lanes,
-        arms=len(arms),
+        arms=len(ring_arms),
         signalised=any(junction.signalised for junction in on_ring),
         names=tuple(sorted(names)),
         ring=ring,
@@ -373,17 +374,14 @@ def _ends(road: Edge) -> tuple[str, str]:
     return road.from_node, road.to_node
 
 
-def largest_junction(streets: Streets) -> StreetJunction | None:
-    """Return the junction with the most incoming lanes; None where the streets have no junction.
+def largest_junctions(streets: Streets) -> list[StreetJunction]:
+    """Return the junctions of at least three roads for cars, without any such junction all others; the largest first.
 
-    Signalised junctions where at least three streets meet come first, so that pedestrian-only signals are ignored.
-    Where there are none, any signals count, then any junction of three streets, then any junction.
+    Those with signals come first. Signals on a single road, such as those of a pedestrian crossing, do not count, since
+    they govern no conflicting movements of cars. Then the number of incoming lanes decides, then the area.
     """
-    crossings = [j for j in streets.junctions if j.is_crossing]
-    signalised = [j for j in streets.junctions if j.signalised]
-    signalised_crossings = [j for j in crossings if j.signalised]
-    candidates = signalised_crossings or signalised or crossings or streets.junctions
-    return min(candidates, key=lambda j: (-j.lanes_in, -j.area.area, j.id), default=None)
+    candidates = [j for j in streets.junctions if j.is_crossing] or streets.junctions
+    return sorted(candidates, key=lambda j: (not j.signalised, -j.lanes_in, -j.area.area, j.id))
 
 
 @dataclass(frozen=True)
@@ -539,14 +537,10 @@ def _arm_areas(streets: Streets, junction: StreetJunction) -> list[BaseGeometry]
     """Return the carriageway of each arm of a junction, as far as the next node."""
     roads = [road for road in streets.network.edges if not set(_ends(road)).isdisjoint(junction.nodes)]
     if junction.ring is not None:
-        arms = roundabouts.ring_arms(junction.ring, roads)
+        grouped = roundabouts.ring_arms(junction.ring, roads)
     else:
-        by_neighbour: dict[str, list[Edge]] = {}
-        for road in roads:
-            neighbour = road.from_node if road.to_node == junction.id else road.to_node
-            by_neighbour.setdefault(neighbour, []).append(road)
-        arms = list(by_neighbour.values())
-    areas = [shapely.union_all([streets.areas[road.id] for road in arm]) for arm in arms]
+        grouped = arms.group_arms(junction.nodes, junction.at_m, roads)
+    areas = [shapely.union_all([streets.areas[road.id] for road in arm]) for arm in grouped]
     return [area for area in areas if not area.is_empty]
 
 
@@ -719,7 +713,7 @@ def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> tup
             if (
                 ring is not None
                 and are_carriageways
-                and roundabouts.is_same_street(ring, edges[entry], edges[exit_index])
+                and arms.is_same_street(ring.middle_m, edges[entry], edges[exit_index])
             ):
                 continue
             to_edge = None if exit_index == entry else edges[exit_index].id

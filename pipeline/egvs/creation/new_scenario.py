@@ -102,7 +102,9 @@ PEOPLE_HINT = (
     "Pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
 
-_NO_SIGNALS_NOTE = "No junction in the map has signals; the one with the most incoming lanes was chosen."
+_NO_SIGNALS_NOTE = (
+    "No junction of three or more roads in the map has signals; the one with the most incoming lanes was chosen."
+)
 
 
 @dataclass(frozen=True)
@@ -119,6 +121,8 @@ class NewRegion:
         Its zones, for which results are reported.
     from_at_m
         Distance of the junction from the requested position, 0 inside it; None without such a position.
+    other_junctions
+        The next junctions of the map by size, each with the option that chooses it; empty with such a position.
     """
 
     junction: StreetJunction
@@ -126,6 +130,7 @@ class NewRegion:
     height_m: float
     zones: tuple[Zone, ...]
     from_at_m: float | None
+    other_junctions: tuple[str, ...] = ()
 
     @property
     def is_far_from_at(self) -> bool:
@@ -318,8 +323,8 @@ class _Draft:
         All roads of the map, and the recordings of its traffic.
     level, roads
         The roads on the level of the junction; those that the scenario keeps, on the ground.
-    junction, window, context
-        The junction, the area within sensor range of its region, and how maps are read there.
+    junction, other_junctions, window, context
+        The junction, the next ones by size, the area within sensor range of its region, and how maps are read there.
     maps, surface
         The static objects of each map, and the heights of roofs and trees.
     terrain, terrain_m, zero, ground
@@ -345,6 +350,7 @@ class _Draft:
     level: RoadSource = field(init=False)
     roads: RoadSource = field(init=False)
     junction: StreetJunction = field(init=False)
+    other_junctions: tuple[str, ...] = ()
     window: BaseGeometry = field(init=False)
     context: MapContext = field(init=False)
     maps: Sequence[ReadMap] = field(init=False)
@@ -440,6 +446,8 @@ def _choose_surroundings(draft: _Draft) -> None:
     """Choose the junction, the roads on its level, and the area within sensor range."""
     path = draft.files.roads.path
     junction = _choose_junction(draft.map_roads.streets, draft.at, draft.recordings, path)
+    if draft.at is None and (draft.recordings is None or draft.recordings.path is None):
+        draft.other_junctions = _describe_others(draft.map_roads.streets)
     level = draft.map_roads.on_level_of(junction)
     if level.streets is not draft.map_roads.streets:
         junction = _find_again(level.streets, junction, draft.map_roads.streets, path)
@@ -605,7 +613,7 @@ def _summarise(draft: _Draft, traffic: ScenarioTraffic, n_solids: int) -> NewSce
     from_at_m = _distance_m(draft.roads.streets, draft.junction, draft.at)
     return NewScenario(
         draft.folder,
-        NewRegion(draft.junction, draft.roi, high_m - low_m, draft.zones, from_at_m),
+        NewRegion(draft.junction, draft.roi, high_m - low_m, draft.zones, from_at_m, draft.other_junctions),
         draft.roads.streets,
         NewStatics(draft.objects.counts, draft.objects.maps, n_solids),
         len(draft.poles),
@@ -716,8 +724,18 @@ def _choose_junction(
     if at is None and recordings is not None and recordings.path is not None:
         return _junction_at(streets, recordings.middle_m(streets), str(recordings.path))
     if at is None:
-        return _require_junction(junctions.largest_junction(streets), path)
+        return _require_junction(next(iter(junctions.largest_junctions(streets)), None), path)
     return _junction_at(streets, _to_world(streets, at), "--at")
+
+
+def _describe_others(streets: Streets) -> tuple[str, ...]:
+    """Return the junctions that follow the largest one, each with the option that chooses it."""
+    largest = [junction for junction in junctions.largest_junctions(streets) if junction.is_crossing]
+    return tuple(f"{junction.title} (--at {_at_option(streets, junction.at_m)})" for junction in largest[1:])
+
+
+def _at_option(streets: Streets, at_m: XY) -> str:
+    return streets.format_position(at_m) if streets.frame is not None else "{:.1f},{:.1f}".format(*at_m)
 
 
 def _to_world(streets: Streets, at: tuple[float, float]) -> XY:

@@ -35,6 +35,8 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         hint = "Leave it out, or make the network anew with netconvert."
         raise InputError(option, f"the SUMO network {path} has its own side of the road and sidewalks", hint)
     roads = network.read_net_xml(path)
+    if roads.lacks_internal_edges:
+        raise network.no_internal_edges_error(path, path)
     text = _GENERATOR.sub("", _read_text(path), count=1)
     return RoadMap(text, has_heights=roads.has_heights, keeps_heights=True)
 

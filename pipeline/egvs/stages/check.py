@@ -31,6 +31,7 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     traffic_checks.check_sumo_locations,
     traffic_checks.check_period_weights,
     traffic_checks.check_demand,
+    traffic_checks.check_internal_edges,
     traffic_checks.check_signals,
     traffic_checks.warn_equal_demand,
     traffic_checks.check_recorded_positions,

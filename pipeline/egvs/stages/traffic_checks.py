@@ -171,6 +171,20 @@ def check_demand(inputs: CheckInputs) -> Iterator[Diagnostic]:
 
 
 @_for_each_period
+def check_internal_edges(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report a network without edges inside junctions; a warning where the traffic is finished."""
+    scenario = inputs.scenario
+    try:
+        path = sumo_folder.network_path(scenario)
+        roads = sumo_folder.read_network(scenario)
+    except InputError:
+        return  # check_times or the checks of the scene report it
+    if path is not None and roads is not None and roads.lacks_internal_edges:
+        finding = Diagnostic.of("traffic", network.no_internal_edges_error(path, path))
+        yield replace(finding, is_error=not scenario.traffic.is_finished)
+
+
+@_for_each_period
 def check_signals(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report plans of signals that do not fit the network."""
     traffic = inputs.scenario.traffic

@@ -563,7 +563,18 @@ class RouteFinder:
         self._lanes = _lanes_per_edge(network, vclass)
         links = network.links(vclass)
         self._links = links[links[:, 2] == 0]
-        self._sources, self._sinks = fringe_edges(self._lanes, self._links)
+        self._sources, self._sinks = self._find_ends()
+
+    def _find_ends(self) -> tuple[IntArray, IntArray]:
+        """Return the edges where routes start and end; none where all are at one node, so that no route leads through.
+
+        Without ends, routes start and end where vehicles are counted.
+        """
+        sources, sinks = fringe_edges(self._lanes, self._links)
+        nodes = {self._edges[i].from_node for i in sources} | {self._edges[i].to_node for i in sinks}
+        if len(nodes) < 2:
+            return sources[:0], sinks[:0]
+        return sources, sinks
 
     @cached_property
     def _pairs(self) -> set[tuple[int, int]]:

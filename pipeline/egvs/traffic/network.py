@@ -330,6 +330,11 @@ class Network:
         return any(lane.has_heights for edge in self.all_edges for lane in edge.lanes)
 
     @cached_property
+    def lacks_internal_edges(self) -> bool:
+        """Whether vehicles jump across all junctions, since the network was made without edges inside them."""
+        return bool(self.connections) and not any(edge.function == "internal" for edge in self.all_edges)
+
+    @cached_property
     def diagonal_m(self) -> float:
         """Diagonal of the bounding box of the ends of all roads."""
         ends = np.array([edge.start_m for edge in self.edges] + [edge.end_m for edge in self.edges])
@@ -380,6 +385,14 @@ def read_net_xml(path: Path, name: Path | None = None) -> Network:
         When the file is not a SUMO network, is damaged, or has no road.
     """
     return _read_network_file(_NamedFile(name or path, path), hash_input(path))
+
+
+def no_internal_edges_error(where: object, path: Path) -> InputError:
+    """Return the error for a network that was made without edges inside junctions."""
+    problem = "the network has no edges inside its junctions (internal links), so vehicles would jump across them"
+    return InputError(
+        where, problem, f"Run netconvert -s {path.name} --no-internal-links false -o new.net.xml, and use it."
+    )
 
 
 @dataclass(frozen=True)

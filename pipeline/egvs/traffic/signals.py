@@ -237,6 +237,8 @@ def read_signals(path: Path, roads: network.Network) -> tuple[Signal, ...]:
     for element in xml.iter_elements(path, "net"):
         try:
             if element.tag == "connection" and "tl" in element.attrib:
+                if "via" not in element.attrib and not element.attrib["from"].startswith(":"):
+                    raise network.no_internal_edges_error(path, path)
                 parts.connections.append(dict(element.attrib))
             elif element.tag == "junction":
                 parts.requests[element.attrib["id"]] = [dict(each.attrib) for each in element.iter("request")]

@@ -97,7 +97,7 @@ def netconvert_flags(extract: OsmExtract, *, lefthand: bool, walk: bool) -> list
 
 
 def build_network(
-    extract: OsmExtract, osm: Path, flags: Sequence[str], frame: Location | None = None
+    extract: OsmExtract, osm: Path, flags: Sequence[str], frame: Location | None = None, radius_m: float | None = None
 ) -> tuple[str, Streets]:
     """Run netconvert on the streets of an extract.
 
@@ -112,6 +112,8 @@ def build_network(
         :data:`LONGEST_PROGRAM_S`.
     frame
         The frame of the network; by default, netconvert chooses one.
+    radius_m
+        Distance at which the streets of a larger extract were cut, for messages.
 
     Returns
     -------
@@ -130,6 +132,9 @@ def build_network(
         "the extract has no drivable streets that meet",
         "Choose an extract with streets for cars (ways with highway=...).",
     )
+    if radius_m is not None:
+        problem = f"no streets for cars meet within {radius_m:g} m of the junction"
+        no_streets = InputError(osm, problem, "Use larger --surroundings, or choose another junction with --at.")
     if not any("highway" in way.tags for way in extract.ways.values()):
         raise no_streets
 
@@ -198,7 +203,7 @@ def crop_network(
 
     ((lon_deg, lat_deg),) = streets.to_degrees([junction.at_m])
     surroundings = cut_surroundings(extract, (lat_deg, lon_deg), radius_m)
-    return build_network(surroundings, osm, flags, location)
+    return build_network(surroundings, osm, flags, location, radius_m)
 
 
 def _frame_flags(frame: Location | None) -> list[str]:
