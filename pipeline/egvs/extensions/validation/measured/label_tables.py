@@ -15,7 +15,7 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan, parse_decimal
-from egvs.formats import csv_tables
+from egvs.formats import spreadsheets
 from egvs.formats.sweep_labels import LabelOptions, SweepLabels, label_class, sweep_name
 
 SIZES = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m")
@@ -51,7 +51,7 @@ def read_labels(path: Path, options: LabelOptions) -> list[SweepLabels]:
         return names
 
     rows: dict[str, list[tuple[str, str, list[float]]]] = {}
-    for where, cells in csv_tables.read_rows(path, check_header):
+    for where, cells in spreadsheets.parse_rows(path, check_header, lambda where, cells: [(where, cells)]):
         values = [_number(where, column[name], cells[column[name]]) for name in SIZES]
         if column["yaw_deg"] in present:
             values.append(math.radians(_number(where, column["yaw_deg"], cells[column["yaw_deg"]])))
