@@ -180,7 +180,7 @@ def test_sheet_with_the_expected_header_is_read(tmp_path: Path) -> None:
 def test_damaged_workbook(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "t.xlsx"
     path.write_bytes(content)
-    with pytest.raises(InputError, match="t.xlsx: cannot be read as a workbook"):
+    with pytest.raises(InputError, match=r"t\.xlsx: cannot be read as a workbook"):
         read(path)
 
 
@@ -191,9 +191,7 @@ def test_cell_in_the_last_corner_needs_no_memory(tmp_path: Path) -> None:
     write_xlsx(path, {"a": (("a", "b"), (1, 2), ("x",))})
     corner = tmp_path / "corner.xlsx"
     _move_last_cell(path, corner)
-    with pytest.raises(
-        InputError, match=r"corner.xlsx: (cannot be read as a workbook|sheet 'a': expected at most 500)"
-    ):
+    with pytest.raises(InputError, match=r"corner\.xlsx: .*(as a workbook|at most 500)"):
         read(corner)
 
 

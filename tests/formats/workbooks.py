@@ -15,6 +15,7 @@ _TYPES = "http://schemas.openxmlformats.org/package/2006/content-types"
 _MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
 _LINKS = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
 _PACKAGE = "http://schemas.openxmlformats.org/package/2006/relationships"
+_MANIFEST = "<manifest xmlns='urn:oasis:names:tc:opendocument:xmlns:manifest:1.0'/>"
 _STYLES = f'<styleSheet xmlns="{_MAIN}"><cellXfs><xf numFmtId="0"/><xf numFmtId="20"/></cellXfs></styleSheet>'  # h:mm
 
 
@@ -22,7 +23,7 @@ def write_xlsx(path: Path, sheets: Mapping[str, Rows], hidden: Sequence[str] = (
     """Write the sheets of a workbook; times of the day have the format h:mm."""
     names = list(sheets)
     entries = "".join(
-        f"<sheet name={quoteattr(name)} sheetId='{n}' r:id='s{n}'{' state=' + quoteattr('hidden') if name in hidden else ''}/>"
+        f"<sheet name={quoteattr(name)} state='{'hidden' if name in hidden else 'visible'}' sheetId='{n}' r:id='s{n}'/>"
         for n, name in enumerate(names)
     )
     links = "".join(
@@ -69,9 +70,7 @@ def write_ods(path: Path, rows: Rows) -> None:
     sheet = f"<office:spreadsheet><table:table table:name='a'>{lines}</table:table></office:spreadsheet>"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mimetype", "application/vnd.oasis.opendocument.spreadsheet")
-        archive.writestr(
-            "META-INF/manifest.xml", "<manifest xmlns='urn:oasis:names:tc:opendocument:xmlns:manifest:1.0'/>"
-        )
+        archive.writestr("META-INF/manifest.xml", _MANIFEST)
         content = f"<office:document-content {spaces}><office:body>{sheet}</office:body></office:document-content>"
         archive.writestr("content.xml", content)
 

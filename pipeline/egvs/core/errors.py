@@ -228,7 +228,7 @@ def _list_locations(locations: Sequence[str]) -> str:
     return list_first([locations[0], *others], _MAX_LOCATIONS)
 
 
-_MAX_LOCATIONS = 5
+_MAX_LOCATIONS = 3
 _UNIT_SUFFIX = re.compile(r"[_ ]*[(\[]?(m|deg|rad|°)[)\]]?$")
 _MIN_SIMILARITY = 0.8
 """Names that share more of their letters than this are similar."""

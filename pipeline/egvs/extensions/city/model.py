@@ -27,7 +27,7 @@ from pathlib import Path
 from pydantic import Field, TypeAdapter, ValidationError
 
 from egvs.core import reading
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, parse_each
 from egvs.core.numbers import number_or_nan, parse_decimal
 from egvs.formats import spreadsheets
 from egvs.scenario.effects_config import EffectsConfig
@@ -145,7 +145,7 @@ def load_city(folder: str | Path) -> City:
         model.name,
         model.seed,
         model.traffic,
-        tuple(_parse_junction(where, row) for where, row in rows),
+        tuple(parse_each(rows, lambda row: _parse_junction(*row), "junctions")),
         model.attribution,
         model.description,
         model.effects,
