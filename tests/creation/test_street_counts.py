@@ -177,7 +177,7 @@ NAMES = (
 )
 HEAD = "street,approach,turn,start,count"
 BAD: dict[str, tuple[list[str], str]] = {
-    "empty": ([""], r"header: expected a column count"),
+    "empty": ([""], r"expected a header and rows, got no values"),
     "no rows": ([HEAD], r"counts.csv: has no counts"),
     "unknown column": (["street,aproach,count", "a,N,1"], r"header: unknown column 'aproach'. Did you mean approach\?"),
     "two columns": (["street,street,count", "a,b,1"], r"two columns are called 'street'"),
@@ -228,9 +228,12 @@ def test_bad_counts_give_one_message(name: str, read: Read) -> None:
         read(*lines)
 
 
-def test_other_encoding_is_named(read: Read) -> None:
-    with pytest.raises(InputError, match="is not UTF-8 text"):
-        read("street,approach,count", "Breite Straße,N,5", encoding="latin-1")
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "cp1252"])
+def test_encodings_of_spreadsheets_give_the_same_counts(read: Read, encoding: str) -> None:
+    rows = ("street;approach;count", ";N;5", ";S;7")
+    expected = read(*rows)
+    assert rates(expected)
+    assert rates(read(*rows, encoding=encoding)) == rates(expected)
 
 
 @pytest.mark.parametrize(

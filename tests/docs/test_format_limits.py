@@ -22,7 +22,7 @@ import pytest
 
 from egvs.core import limits, reading
 from egvs.core.errors import EgvsError
-from egvs.formats import csv_tables, meshes, osm, point_clouds, reader_process, vector_files, xml
+from egvs.formats import meshes, osm, point_clouds, reader_process, spreadsheets, vector_files, xml
 from egvs.traffic import fcd, user_files
 from egvs.traffic.user_files import DemandFiles
 from egvs.world import footprints
@@ -31,6 +31,7 @@ from tests.formats import foreign_files
 from tests.formats.test_e57 import ONE_POINT, write_e57
 from tests.formats.test_point_clouds import las
 from tests.formats.test_small_files_that_grow import geoparquet
+from tests.formats.workbooks import write_xlsx
 from tests.installed import EXTENSIONS, needs
 
 pytestmark = [
@@ -198,6 +199,15 @@ def read_points(path: Path) -> object:
     return point_clouds.read_points(path, path.name)
 
 
+def write_workbook(path: Path, mb: float) -> None:
+    numbers = np.random.default_rng(1).random((10 + int(mb * 60_000), 2)).tolist()
+    write_xlsx(path, {"a": [("a", "b"), *numbers]})
+
+
+def read_table(path: Path) -> object:
+    return spreadsheets.read_rows(path, lambda names: names)
+
+
 def read_layer(path: Path) -> object:
     return vector_files.read_gis_file(path, "Point")
 
@@ -209,8 +219,11 @@ TRIALS = {
         "a.geojson", text(polygon(3)), read_polygon, {"EGVS_MAX_HOLES": 2, "EGVS_MAX_CORNERS": 3}
     ),
     "tables in CSV": Trial(
-        "a.csv", text("a,b\n1,2\n"), lambda path: list(csv_tables.read_rows(path, lambda names: names)),
-        {"EGVS_MAX_DOCUMENT_MB": 1},
+        "a.csv", text("a,b\n1,2\n"), read_table, {"EGVS_MAX_DOCUMENT_MB": 1},
+    ),
+    "workbooks (xlsx, xls, ods)": Trial(
+        "a.xlsx", write_workbook, read_table,
+        {"EGVS_MAX_DOCUMENT_MB": 1, "EGVS_MAX_READER_MB": 20},
     ),
     "XML of any kind": Trial(
         "a.xml", lambda path, mb: path.write_text(f"<net><a/><b/><c>{' ' * int(mb * 1e6)}</c></net>"),  # type: ignore[arg-type,return-value]

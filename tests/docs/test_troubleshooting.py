@@ -110,7 +110,7 @@ BAD_SITE = "site,x_m,y_m,z_m\nbad,{},3\n"
         ("Longitude and latitude belong", ["check", "{mini}"], BAD_SITE.format("-170,80")),
         ("z_m = ", ["check", "{mini}"], "site,x_m,y_m,z_m\nbad,10,12,-1\n"),
         ("unknown column", ["check", "{mini}"], "site,x_m,y_m,z_m,yaw_dge\nbad,10,12,3,0\n"),
-        ("the columns are separated by", ["check", "{mini}"], "site;x_m;y_m;z_m\nbad;10;12;3\n"),
+        ("… can mean … or …", ["check", "{mini}"], "site;x_m;y_m;z_m\nbad;10,250;12;3\n"),
     ],
 )
 def test_command_prints_the_quoted_message(

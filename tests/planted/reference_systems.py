@@ -239,7 +239,7 @@ REFERENCE_SYSTEMS = (
         "metres and degrees of sites that differ",
         make(MAP, file("sites.csv", lambda s: both_coordinates(s.truth, 0.0))),
         file("sites.csv", lambda s: both_coordinates(s.truth, 25.0)),
-        "sites.csv: row pole_a",
+        "sites.csv: line 2 (pole_a)",
         "25.0 m away",
         tolerance=ROUNDED,
     ),

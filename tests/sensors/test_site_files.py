@@ -109,7 +109,7 @@ def test_reports_misspelt_column_once_for_all_rows(mini: Path, tmp_path: Path, r
     code, _, output = run_egvs("run", mini, "--out", tmp_path)
     assert code == 2
     assert output.count("unknown column 'yaw'. Did you mean yaw_deg?") == 1
-    assert "row a and 2 more: " in output
+    assert "line 2 (a), line 3 (b), line 4 (c): " in output
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_rejects_column_that_other_programs_use_for_a_known_one(mini: Path, name
     (mini / "sites.csv").write_text(f"site,x_m,y_m,{name}\na,10,12,4\nb,30.5,-12,4\n")
     with pytest.raises(InputError, match=re.escape(hint)) as error:
         sites_from(mini, file='"sites.csv"', heights_m="[3, 4.5, 6]")
-    assert f"row a and 1 more: the column {name!r} has no effect" in str(error.value)
+    assert f"sites.csv: line 2 (a), line 3 (b): the column {name!r} has no effect" in str(error.value)
     assert str(error.value).count(hint) == 1
 
 

@@ -194,7 +194,7 @@ PLACE = "site,x_m,y_m\np,0,0\n"
 @pytest.mark.parametrize(
     ("rows", "keys", "message"),
     [
-        (PLACE, {}, r"row p: z_m is missing.*site, x_m, y_m, z_m"),
+        (PLACE, {}, r"line 2 \(p\): z_m is missing.*site, x_m, y_m, z_m"),
         (ROW, {"heights_m": "[3, 4]"}, r"sites\.heights_m: .*no effect on any site.*z_m from the rows of sites"),
         (
             "site,x_m,y_m,z_m,yaw_deg\np,0,0,6,0\n",
@@ -215,27 +215,35 @@ PLACE = "site,x_m,y_m\np,0,0\n"
             r"Use sites\.replace_sensor=OS1-128 to replace them",
         ),
         ("site,x_m,y_m,z_m,sensor\np,0,0,6,VLP-16\n", {"sensor": "OS1-129"}, r"sites\.sensor: .*no effect on any site"),
-        (ROW, {"pitch_deg": '"aim"'}, r"row p: pitch_deg: .*'aim', but there is no aim.*aim = \"roi\", or aim_m"),
+        (
+            ROW,
+            {"pitch_deg": '"aim"'},
+            r"line 2 \(p\): pitch_deg: .*'aim', but there is no aim.*aim = \"roi\", or aim_m",
+        ),
         (
             "site,x_m,y_m,z_m,yaw_deg\np,0,0,6,30\n",
             {"aim": "roi", "pitch_deg": '"aim"'},
-            r"row p: pitch_deg: .*'aim', but .*yaw_deg, 30",
+            r"line 2 \(p\): pitch_deg: .*'aim', but .*yaw_deg, 30",
         ),
-        (ROW, {"aim_m": "[0, 0, 1]"}, r"row p: aim: \(0, 0, 1\) is directly above or below the sensor"),
+        (ROW, {"aim_m": "[0, 0, 1]"}, r"line 2 \(p\): aim: \(0, 0, 1\) is directly above or below the sensor"),
         (
             ROW,
             {"aim": "roi", "sensor": "VLP-33"},
             r"^--set: sites.sensor: unknown sensor 'VLP-33'. Did you mean VLP-32C",
         ),
-        ("site,x_m,y_m,z_m,aim_x_m\np,0,0,6,5\n", {}, r"row p: aim: one of aim_x_m and aim_y_m is missing"),
-        ("site,x_m,y_m,z_m,aim\np,0,0,6,ROI\n", {}, r"row p: aim: .*'roi', got 'ROI'.*aim_x_m and aim_y_m"),
-        ("site,x_m,y_m,z_m,aim,aim_x_m\np,0,0,6,roi,3\n", {}, r"row p: aim: .*'roi' and at a point"),
-        ("site,x_m,y_m,z_m,aim_x_m,aim_y_m\np,0,0,6,5,north\n", {}, r"row p: aim_y_m: .*finite number.*'north'"),
-        ("site,x_m,y_m,z_m,yaw_deg,aim_x_m,aim_y_m\np,0,0,6,9,5,5\n", {}, r"row p: yaw_deg: .*yaw_deg = 9 and an aim"),
+        ("site,x_m,y_m,z_m,aim_x_m\np,0,0,6,5\n", {}, r"line 2 \(p\): aim: one of aim_x_m and aim_y_m is missing"),
+        ("site,x_m,y_m,z_m,aim\np,0,0,6,ROI\n", {}, r"line 2 \(p\): aim: .*'roi', got 'ROI'.*aim_x_m and aim_y_m"),
+        ("site,x_m,y_m,z_m,aim,aim_x_m\np,0,0,6,roi,3\n", {}, r"line 2 \(p\): aim: .*'roi' and at a point"),
+        ("site,x_m,y_m,z_m,aim_x_m,aim_y_m\np,0,0,6,5,north\n", {}, r"line 2 \(p\): aim_y_m: .*finite number.*'north'"),
+        (
+            "site,x_m,y_m,z_m,yaw_deg,aim_x_m,aim_y_m\np,0,0,6,9,5,5\n",
+            {},
+            r"line 2 \(p\): yaw_deg: .* = 9 and an aim",
+        ),
         (
             "site,x_m,y_m,z_m,points\np,0,0,6,a.ply\n",
             {"pitch_deg": "[0, -10]"},
-            r"row p: points: .*one measured scan is given for 2 mounts",
+            r"line 2 \(p\): points: .*one measured scan is given for 2 mounts",
         ),
         (
             "site,x_m,y_m,z_m,pitch_deg\np,0,0,6,\np@0deg,1,1,5,3\n",

@@ -446,11 +446,11 @@ def test_reports_all_wrong_rows_of_sites_file(street: Path) -> None:
     sites(street, "a,10,12,x", "b,10,12,3", "b,11,12,3", "c,,12,3", "d,10,12,3", "e,1_0,12,3", "f,10,\u0661\u0662,3")
     assert found(street) == {
         "sites": [
-            "sites.csv: row a: z_m: expected a finite number of at most 1e+08, got 'x'",
-            "sites.csv: row b: there are two sites 'b'",
-            "sites.csv: row c: x_m is missing",
-            "sites.csv: row e: x_m: expected a finite number of at most 1e+08, got '1_0'",
-            "sites.csv: row f: y_m: expected a finite number of at most 1e+08, got '\u0661\u0662'",
+            "sites.csv: line 2 (a): z_m: expected a finite number of at most 1e+08, got 'x'",
+            "sites.csv: line 4 (b): there are two sites 'b'",
+            "sites.csv: line 5 (c): x_m is missing",
+            "sites.csv: line 7 (e): x_m: expected a finite number of at most 1e+08, got '1_0'",
+            "sites.csv: line 8 (f): y_m: expected a finite number of at most 1e+08, got '\u0661\u0662'",
         ]
     }
 

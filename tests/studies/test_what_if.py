@@ -252,8 +252,8 @@ def test_wrong_tables_get_one_message(tmp_path: Path, run_egvs: Any, monkeypatch
 
 
 def test_wrong_number_names_row_and_column(tmp_path: Path) -> None:
-    path = scenario(tmp_path, FAR, parked_csv='x_m,y_m,yaw_deg,type\n1,2,0,car\n"1,5",2,0,car\n')
-    with pytest.raises(InputError, match=r"parked.csv: line 3: x_m: expected a number, got '1,5'"):
+    path = scenario(tmp_path, FAR, parked_csv="x_m,y_m,yaw_deg,type\n1,2,0,car\n1_5,2,0,car\n")
+    with pytest.raises(InputError, match=r"parked.csv: line 3: x_m: expected a number, got '1_5'"):
         solid_documents(load(path), "far")
 
 

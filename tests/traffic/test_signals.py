@@ -299,7 +299,7 @@ CSV = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\nb,east,a
     ("name", "content", "message"),
     [
         ("p.csv", "phase,approach\na,north\n", "the column 'movement' is missing"),
-        ("p.csv", "", "the column 'phase' is missing"),
+        ("p.csv", "", "expected a header and rows, got no values"),
         ("p.csv", CSV.replace("a,south,all,30", "a,south,all,25"),
          "line 3: green_s: expected 30 as before in phase 'a', got 25"),
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all,often"), "line 4: green_s: expected seconds, got 'often'"),

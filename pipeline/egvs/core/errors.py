@@ -14,16 +14,19 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from egvs.core.wording import list_first
 
 MAX_LINE_LENGTH, MAX_LINES = 600, 200
 """Limits of a message in characters and lines."""
+
+Item = TypeVar("Item")
+Parsed = TypeVar("Parsed")
 
 _CONTROL_CHARACTERS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """Characters that control a terminal, and lone surrogates, which cannot be encoded."""
@@ -188,6 +191,54 @@ class DiagnosticsError(InputError):
         super().__init__(first.where, first.problem, "\n".join([first.hint, *map(str, others)]))
 
 
+def raise_together(errors: Iterable[InputError], rule: str) -> None:
+    """Raise the errors of a file as one; do nothing if there are none.
+
+    The same problem in several rows, such as a misspelt column, is reported once with the first rows.
+
+    Parameters
+    ----------
+    errors
+        In the order of the file.
+    rule
+        The rule of each :class:`Diagnostic`.
+    """
+    rows: dict[tuple[str, str], dict[str, None]] = {}
+    for error in errors:
+        findings = error.findings if isinstance(error, DiagnosticsError) else (error,)
+        for finding in findings:
+            rows.setdefault((finding.problem, finding.hint), {})[finding.where] = None
+    grouped = [
+        Diagnostic(rule, _list_locations(list(locations)), problem, hint, is_error=True)
+        for (problem, hint), locations in rows.items()
+    ]
+    if len(grouped) == 1:
+        raise InputError(grouped[0].where, grouped[0].problem, grouped[0].hint)
+    if grouped:
+        raise DiagnosticsError(grouped)
+
+
+def parse_each(items: Iterable[Item], parse: Callable[[Item], Parsed], rule: str) -> list[Parsed]:
+    """Parse all items, and raise the errors of all of them as one (:func:`raise_together`)."""
+    parsed: list[Parsed] = []
+    errors: list[InputError] = []
+    for item in items:
+        try:
+            parsed.append(parse(item))
+        except InputError as error:
+            errors.append(error)
+    raise_together(errors, rule)
+    return parsed
+
+
+def _list_locations(locations: Sequence[str]) -> str:
+    """Return the first locations; the file that they begin with is named once."""
+    file = locations[0].partition(": ")[0] + ": "
+    others = [where.removeprefix(file) for where in locations[1:]]
+    return list_first([locations[0], *others], _MAX_LOCATIONS)
+
+
+_MAX_LOCATIONS = 3
 _UNIT_SUFFIX = re.compile(r"[_ ]*[(\[]?(m|deg|rad|°)[)\]]?$")
 _MIN_SIMILARITY = 0.8
 """Names that share more of their letters than this are similar."""

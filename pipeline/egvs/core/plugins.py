@@ -28,6 +28,7 @@ _PACKAGES = {
     "PIL": "Pillow",
     "osi3": "osi-python",
     "pxr": "usd-core",
+    "python_calamine": "python-calamine",
     "sklearn": "scikit-learn",
     "torch": "PyTorch",
     "velodyne_decoder": "velodyne-decoder",

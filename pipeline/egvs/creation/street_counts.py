@@ -28,12 +28,12 @@ from typing import Any
 
 import tomlkit
 
-from egvs.core.errors import InputError, find_misspelling
+from egvs.core.errors import InputError, find_misspelling, parse_each
 from egvs.core.numbers import number_or_nan
 from egvs.core.wording import list_first, number_of
 from egvs.creation import junctions, scenario_files
 from egvs.creation.junctions import StreetJunction, Streets
-from egvs.formats import csv_tables
+from egvs.formats import spreadsheets
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
 from egvs.traffic.approaches import TURN_WORDS, ApproachIndex, ApproachMovement, parse_lane_group
 from egvs.traffic.movements import MovementNames
@@ -306,9 +306,9 @@ def _movement_name(move: ApproachMovement) -> str:
     return f"{move.approach_title} {move.turn}".strip()
 
 
-def _read_rows(path: Path, index: ApproachIndex, edges: frozenset[str], kinds: frozenset[str]) -> Iterator[_Row]:
-    for where, values in csv_tables.read_rows(path, partial(_check_header, path)):
-        yield from _parse_row(where, values, index, edges, kinds)
+def _read_rows(path: Path, index: ApproachIndex, edges: frozenset[str], kinds: frozenset[str]) -> list[_Row]:
+    parse = partial(_parse_row, index=index, edges=edges, kinds=kinds)
+    return spreadsheets.parse_rows(path, partial(_check_header, path), parse)
 
 
 def _check_header(path: Path, header: list[str]) -> list[str]:
@@ -356,10 +356,10 @@ def _parse_row(
         vehicles = _parse_count(f"{where}: count", values["count"])
         yield _Row(where, title, movements, is_split, kind, start_min, minutes, vehicles)
         return
-    for name, cell in values.items():
-        if _CLOCK.fullmatch(name) and cell:
-            vehicles = _parse_count(f"{where}: {name}", cell)
-            yield _Row(where, title, movements, is_split, kind, _parse_clock(where, name), minutes, vehicles)
+    starts = [name for name, cell in values.items() if _CLOCK.fullmatch(name) and cell]
+    counts = parse_each(starts, lambda name: _parse_count(f"{where}: {name}", values[name]), "counts")
+    for name, vehicles in zip(starts, counts, strict=True):
+        yield _Row(where, title, movements, is_split, kind, _parse_clock(where, name), minutes, vehicles)
 
 
 def _find_movements(

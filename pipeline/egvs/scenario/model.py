@@ -221,8 +221,8 @@ class SitesConfig(StrictModel):
 
     file: str | None = Field(
         None,
-        description="CSV file (site, x_m, y_m, z_m, ...), or points in GeoJSON, GeoPackage, Shapefile, GeoParquet or"
-        " KML",
+        description="Table (CSV, xlsx, ods) with site, x_m, y_m, z_m, ..., or points in GeoJSON, GeoPackage, Shapefile,"
+        " GeoParquet or KML",
     )
     grid: SiteGrid | None = None
     along: tuple[SiteLine, ...] = ()

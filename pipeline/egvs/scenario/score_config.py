@@ -109,7 +109,7 @@ class ZoneArea(StrictModel):
     polygon_m: Corners | None = Field(None, description="Corners in the world frame, in order; or give file")
     file: str | None = Field(
         None,
-        description="GeoJSON, GeoPackage, Shapefile, KML, GeoParquet, or CSV with a row per corner. Of a file with "
+        description="GeoJSON, GeoPackage, Shapefile, KML, GeoParquet, or a table with a row per corner. Of a file with "
         "several areas, the zone takes those of its own name",
     )
 
@@ -181,7 +181,7 @@ class ScoreConfig(StrictModel):
     )
     zones: str | None = Field(
         None,
-        description="GeoJSON, GeoPackage, Shapefile, KML, GeoParquet, or CSV with a row per corner: areas with names, "
+        description="GeoJSON, GeoPackage, Shapefile, KML, GeoParquet, or a table with a row per corner: named areas, "
         "for which zones.parquet reports the road users found, by class. They change no score",
     )
 

@@ -62,8 +62,8 @@ class SignalConfig(StrictModel):
     file: str | None = Field(
         None,
         min_length=1,
-        description="Plan in a file, instead of phases: a CSV (phase, approach, movement, green_s), or a SUMO file with"
-        " a <tlLogic>",
+        description="Plan in a file, instead of phases: a table (phase, approach, movement, green_s), or a SUMO"
+        " file with a <tlLogic>",
     )
     type: Literal["fixed", "actuated"] = Field(
         "fixed", description="'actuated' extends greens up to max_green_s while vehicles arrive"

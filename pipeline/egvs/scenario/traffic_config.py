@@ -377,7 +377,7 @@ class TrafficConfig(StrictModel):
     observed: str | None = Field(
         None,
         min_length=1,
-        description="CSV file with queues and speeds that were observed on approaches (columns approach or street, or"
+        description="Table with queues and speeds that were observed on approaches (columns approach or street, or"
         " both, and queue_m or speed_kmh, or both; period where there are periods), to compare with the simulated ones",
     )
     kinds: tuple[VehicleKind, ...] = Field(

@@ -27,7 +27,7 @@ class WhatIfConfig(StrictModel):
     share: Annotated[float, Field(gt=0, le=1)] = Field(description="Share of the time with these solids, above 0, to 1")
     vehicles: str | None = Field(
         None,
-        description="CSV file of parked vehicles: x_m, y_m (centre), yaw_deg, type (car, van, truck, bus, ...; a kind"
+        description="Table of parked vehicles: x_m, y_m (centre), yaw_deg, type (car, van, truck, bus, ...; a kind"
         " of traffic.kinds with this name sets its size)",
     )
     footprints: tuple[str, ...] = Field((), description="Files of further solids, as for statics.footprints")

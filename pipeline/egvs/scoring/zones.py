@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from egvs.core import limits
-from egvs.core.errors import Diagnostic, InputError
+from egvs.core.errors import Diagnostic, InputError, raise_together
 from egvs.core.wording import format_percent, list_first
+from egvs.formats import spreadsheets
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scenario.score_config import ZoneArea
@@ -167,7 +168,7 @@ def _read_areas(path: Path, world: Georeference, *, need_names: bool = False) ->
     """Return the areas of a file by name; parts of the same name are joined."""
     import shapely
 
-    if path.suffix.lower() == ".csv":
+    if path.suffix.lower() in spreadsheets.SUFFIXES:
         return _read_corners(path, world)
     parts: dict[str, list[BaseGeometry]] = {}
     for name, polygon in footprints.read_named_polygons(path, world, need_names=need_names):
@@ -180,11 +181,16 @@ def _read_corners(path: Path, world: Georeference) -> dict[str, BaseGeometry]:
     import shapely
 
     corners: dict[str, list[tuple[float, float]]] = {}
-    for row in site_files.read_csv(path, world):
-        name = str(row.columns.get("zone") or "").strip()
-        if not name:
-            raise InputError(row.where, "zone is missing", "Use the columns zone, x_m, y_m, one row per corner.")
-        corners.setdefault(name, []).append(site_files.row_position_m(row))
+    rows, errors = site_files.read_table(path, world)
+    for row in rows:
+        try:
+            name = str(row.columns.get("zone") or "")
+            if not name:
+                raise InputError(row.where, "zone is missing", "Use the columns zone, x_m, y_m, one row per corner.")
+            corners.setdefault(name, []).append(site_files.row_position_m(row))
+        except InputError as error:
+            errors.append(error)
+    raise_together(errors, "zones")
     areas: dict[str, BaseGeometry] = {}
     for name, points in corners.items():
         if len(points) < _MIN_CORNERS:

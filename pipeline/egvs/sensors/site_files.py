@@ -14,8 +14,6 @@ use for what this program reads from a column of another name (:data:`FOREIGN_CO
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import re
@@ -28,12 +26,11 @@ from typing import Any
 import numpy as np
 
 from egvs.core import limits
-from egvs.core.digests import open_input
 from egvs.core.errors import InputError, find_misspelling
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import read_json
-from egvs.formats import vector_files
+from egvs.formats import spreadsheets, vector_files
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference, declared_crs, geojson_coordinates
 
 REQUIRED_COLUMNS = ("site", "x_m", "y_m", "z_m")
@@ -67,7 +64,6 @@ _TOLERANCE_M = 0.1
 _MAX_M = 1e8  # larger values are not on Earth; they are rejected when the row is parsed
 _COLUMNS_HINT = "Use the columns x_m, y_m for metres of the world frame, or longitude, latitude for degrees."
 
-_MAX_COLUMNS = 500
 _COLUMN_NAME = re.compile(r"[^\x00-\x1f]{1,80}")
 _PLAIN_NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,17})(\.[0-9]+)?")  # "007" is a name
 
@@ -93,28 +89,24 @@ class SiteRow:
     heights_m: tuple[float, ...] = ()
 
 
-def read_csv(path: Path, world: Georeference) -> Iterator[SiteRow]:
-    """Yield the rows of a CSV; InputError with file and row for a malformed one."""
+def read_table(path: Path, world: Georeference) -> tuple[list[SiteRow], list[InputError]]:
+    """Return the valid rows of a CSV file or a workbook, and the errors of the others, with file and row.
+
+    Raises
+    ------
+    InputError
+        When the file is no table (:func:`egvs.formats.spreadsheets.read_rows`), or its coordinates are not in the
+        system that the names of its columns say.
+    """
+    table = spreadsheets.read_rows(path, lambda names: names)
     located = []
-    try:
-        with (
-            open_input(path) as content,
-            io.TextIOWrapper(content, encoding="utf-8-sig", newline="") as file,
-        ):
-            reader = csv.DictReader(file, skipinitialspace=True)
-            _check_header(path, list(reader.fieldnames or ()))
-            for values in reader:
-                where = f"{path}: row {values.get('site') or '?'}"
-                if None in values or None in values.values():
-                    raise InputError(where, "the row has more or fewer values than the header has columns")
-                located.append(SiteRow(where, dict(values)))
-                check_site_count(len(located), path, "each row is one", "Use fewer rows.")
-    except (UnicodeDecodeError, csv.Error) as error:
-        hint = "Save it as UTF-8 text with a header row."
-        raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None
-    rows = parse_numeric_columns(rows_in_world_frame(located, path, world), KNOWN_COLUMNS)
-    for row, columns in zip(located, rows, strict=True):
-        yield SiteRow(row.where, columns)
+    for where, values in table.rows:
+        located.append(SiteRow(f"{where} ({values['site']})" if values.get("site") else where, values))
+        check_site_count(len(located), path, "each row is one", "Use fewer rows.")
+    located, errors = _rows_in_world_frame(located, path, world)
+    columns = _parse_numeric_columns([row.columns for row in located], KNOWN_COLUMNS)
+    rows = [SiteRow(row.where, values) for row, values in zip(located, columns, strict=True)]
+    return rows, [*table.errors, *errors]
 
 
 _FEWER_CANDIDATES = "Use a wider spacing, or fewer heights and pitches."
@@ -127,22 +119,10 @@ def check_site_count(count: float, where: object, reason: str, hint: str = _FEWE
         raise InputError(where, problem, f"{hint} {limits.SITES.hint}")
 
 
-def _check_header(path: Path, names: list[str]) -> None:
-    if len(names) == 1:
-        for separator in (";", "\t", "|"):
-            if separator in names[0]:
-                hint = "Use commas, and decimal points in the numbers."
-                raise InputError(path, f"the columns are separated by {separator!r}", hint)
-    _check_column_count(path, names)
-    duplicates = sorted({name for name in names if names.count(name) > 1})
-    if duplicates:
-        raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Use each column name once.")
-
-
 def _check_column_count(path: Path, names: Collection[str]) -> None:
     """Raise an InputError when the sites of a file have too many columns: each is compared with the known ones."""
-    if len(names) > _MAX_COLUMNS:
-        problem = f"expected at most {_MAX_COLUMNS} columns, got {len(names):,}"
+    if len(names) > spreadsheets.MAX_COLUMNS:
+        problem = f"expected at most {spreadsheets.MAX_COLUMNS} columns, got {len(names):,}"
         raise InputError(path, problem, "Remove columns that describe no site.")
 
 
@@ -210,39 +190,49 @@ def _point_to_world(point: list[Any], reading: CoordinateReading) -> list[Any]:
     return [*reading.to_world(np.array([[x, y]]))[0].tolist(), *point[2:]]
 
 
-def rows_in_world_frame(rows: Iterable[SiteRow], path: object, world: Georeference) -> list[dict[str, Any]]:
-    """Return the columns of CSV rows with ``x_m, y_m`` in the world frame, and without longitude and latitude.
+def _rows_in_world_frame(
+    rows: list[SiteRow], path: object, world: Georeference
+) -> tuple[list[SiteRow], list[InputError]]:
+    """Return the rows with ``x_m, y_m`` in the world frame and without longitude and latitude, and errors of others.
 
     Missing values and values that are no numbers are left as they are; they are rejected when the row is parsed.
 
     Raises
     ------
     InputError
-        When columns named in metres hold degrees, when both kinds of coordinates disagree, or when no row lies near the
-        region of interest.
+        When columns named in metres hold degrees, or when no row lies near the region of interest.
     """
-    rows = list(rows)
-    names = [_lon_lat_columns(row.columns) for row in rows]
     metres = [(number_or_nan(row.columns.get("x_m")), number_or_nan(row.columns.get("y_m"))) for row in rows]
     plausible = [(x, y) for x, y in metres if abs(x) <= _MAX_M and abs(y) <= _MAX_M]
     world.check_metres(_as_points(plausible), str(path), _COLUMNS_HINT)
-    if not any(names):
-        return [row.columns for row in rows]
-    degrees, without_degrees, needs_degrees = [], [], False
-    for row, columns, xy_m in zip(rows, names, metres, strict=True):
-        lon_lat = _parse_lon_lat(row, columns)
-        degrees.append(lon_lat)
-        without_degrees.append({name: value for name, value in row.columns.items() if name not in (columns or ())})
+    if not rows or (names := _lon_lat_columns(rows[0].columns)) is None:
+        return rows, []
+    located: list[tuple[SiteRow, tuple[float, float] | None]] = []
+    errors = []
+    needs_degrees = False
+    for row, xy_m in zip(rows, metres, strict=True):
+        try:
+            lon_lat = _parse_lon_lat(row, names)
+        except InputError as error:
+            errors.append(error)
+            continue
+        columns = {name: value for name, value in row.columns.items() if name not in names}
+        located.append((SiteRow(row.where, columns), lon_lat))
         if lon_lat is not None and not math.isfinite(sum(xy_m)):
             needs_degrees = True
     if world.frame is None and not needs_degrees:
-        return without_degrees
-    known = _as_points([lon_lat for lon_lat in degrees if lon_lat is not None])
+        return [row for row, _ in located], errors
+    known = _as_points([lon_lat for _, lon_lat in located if lon_lat is not None])
     reading = world.read_coordinates(known, str(path), WGS84, _COLUMNS_HINT)
-    located = []
-    for row, other_columns, lon_lat in zip(rows, without_degrees, degrees, strict=True):
-        located.append(other_columns | _row_to_world(row, lon_lat, reading))
-    return located
+    converted = []
+    for row, lon_lat in located:
+        try:
+            columns = row.columns | _row_to_world(row, lon_lat, reading)
+        except InputError as error:
+            errors.append(error)
+        else:
+            converted.append(SiteRow(row.where, columns))
+    return converted, errors
 
 
 def _as_points(pairs: list[tuple[float, float]]) -> FloatArray:
@@ -259,9 +249,9 @@ def _lon_lat_columns(row: Mapping[str, Any]) -> tuple[str, str] | None:
     return lon, lat
 
 
-def _parse_lon_lat(row: SiteRow, columns: tuple[str, str] | None) -> tuple[float, float] | None:
+def _parse_lon_lat(row: SiteRow, columns: tuple[str, str]) -> tuple[float, float] | None:
     """Longitude and latitude of a row, degrees, checked; None where both are empty."""
-    if columns is None or all(row.columns[name] in (None, "") for name in columns):
+    if all(row.columns[name] in (None, "") for name in columns):
         return None
     lon, lat = columns
     for name, limit_deg in ((lon, 180.0), (lat, 90.0)):
@@ -337,12 +327,11 @@ def _check_foreign_columns(where: str, row: Mapping[str, Any]) -> None:
             raise InputError(where, f"the column {name!r} has no effect", hint)
 
 
-def parse_numeric_columns(rows: Iterable[dict[str, Any]], known: Collection[str]) -> list[dict[str, Any]]:
-    """Return rows of a CSV with numbers instead of texts in the user columns that hold only numbers.
+def _parse_numeric_columns(rows: list[dict[str, Any]], known: Collection[str]) -> list[dict[str, Any]]:
+    """Return rows of a table with numbers instead of texts in the user columns that hold only numbers.
 
     An empty cell becomes None.
     """
-    rows = list(rows)
     names = {name for row in rows for name in row}
     for name in names - set(known):
         texts = [row[name].strip() for row in rows if row.get(name)]

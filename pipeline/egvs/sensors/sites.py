@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -32,10 +32,9 @@ from typing import Any, Literal
 import numpy as np
 
 from egvs.core import polylines
-from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, unknown_site
+from egvs.core.errors import InputError, parse_each, raise_together, unknown_site
 from egvs.core.grid import Vec3
 from egvs.core.special import cosdg, sindg
-from egvs.core.wording import list_first
 from egvs.formats import vector_files
 from egvs.scenario.fields import MAX_COORDINATE_M, same_name
 from egvs.scenario.model import Scenario, SiteGrid, SiteLine
@@ -170,8 +169,8 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
     builder = _SiteBuilder(scenario)
     sites: dict[str, Site] = {}
     names: dict[str, str] = {}
-    errors: list[InputError] = []
-    for row in _site_rows(scenario, path):
+    rows, errors = _site_rows(scenario, path)
+    for row in rows:
         try:
             for site in builder.candidates(row):
                 other = names.setdefault(same_name(site.name), site.name)
@@ -184,8 +183,7 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
         except InputError as error:
             errors.append(error)
         site_files.check_site_count(len(sites), path, "each combination of location, height and pitch is one")
-    if errors:
-        raise DiagnosticsError(_group_errors(errors))
+    raise_together(errors, "sites")
     if not sites:
         raise InputError(path, "expected at least one site, got none")
     _check_unused_keys(scenario, builder.used_keys, path)
@@ -193,17 +191,18 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
     return _with_measured_scan(tuple(sites.values()), scenario)
 
 
-def _site_rows(scenario: Scenario, path: Path) -> Iterator[SiteRow]:
+def _site_rows(scenario: Scenario, path: Path) -> tuple[Iterable[SiteRow], list[InputError]]:
+    """Return the rows of the file or the rule, and what is wrong with the other rows of a table."""
     config = scenario.sites
     if config.file is not None:
         world = geolocation.scenario_georeference(scenario)
         if path.suffix.lower() in (".geojson", ".json") or vector_files.is_gis_file(path):
             is_kml = path.suffix.lower() == ".kml"
-            return site_files.read_features(path, world, has_relief=is_kml and _has_relief(scenario))
-        return site_files.read_csv(path, world)
+            return site_files.read_features(path, world, has_relief=is_kml and _has_relief(scenario)), []
+        return site_files.read_table(path, world)
     if config.grid is not None:
-        return _grid_rows(config.grid)
-    return _line_rows(config.along)
+        return _grid_rows(config.grid), []
+    return _line_rows(config.along), []
 
 
 def _has_relief(scenario: Scenario) -> bool:
@@ -215,15 +214,6 @@ def _has_relief(scenario: Scenario) -> bool:
         return False
     span_m, farthest_m = terrain.relief_m(network.read_net_xml(path))
     return max(span_m, abs(farthest_m)) > terrain.MIN_RELIEF_M
-
-
-def _group_errors(errors: list[InputError]) -> Iterator[Diagnostic]:
-    """Report each problem once; a misspelt column, for example, is an error in every row."""
-    rows: dict[tuple[str, str], dict[str, None]] = {}
-    for error in errors:
-        rows.setdefault((error.problem, error.hint), {})[error.where] = None
-    for (problem, hint), locations in rows.items():
-        yield Diagnostic.of("sites", InputError(list_first(list(locations), 1), problem, hint))
 
 
 _OVERRIDING_COLUMNS = {
@@ -502,11 +492,9 @@ def _check_columns(row: SiteRow, scenario: Scenario) -> None:
 
 
 def _mount_request(row: SiteRow, scenario: Scenario) -> MountRequest:
-    numbers: dict[str, float] = {}
-    for key in site_files.NUMBER_COLUMNS:
-        value = row.columns.get(key)
-        if value not in (None, ""):
-            numbers[key] = _parse_number(row.where, key, value)
+    keys = [key for key in site_files.NUMBER_COLUMNS if row.columns.get(key) not in (None, "")]
+    values = parse_each(keys, lambda key: _parse_number(row.where, key, row.columns[key]), "sites")
+    numbers = dict(zip(keys, values, strict=True))
     heights_m = row.heights_m
     ground_m = numbers.get("ground_m", 0.0)
     if not heights_m and "z_m" in numbers:

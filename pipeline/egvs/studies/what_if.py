@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core.errors import DECIMAL_COMMA_HINT, InputError
+from egvs.core.errors import InputError, parse_each
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import number_or_nan, parse_decimal
 from egvs.core.platform import relative_path
@@ -39,7 +39,7 @@ from egvs.core.special import cosdg, sindg
 from egvs.core.wording import format_percent, number_of
 from egvs.drawing.basemap import solid_group
 from egvs.effects import registry
-from egvs.formats import csv_tables
+from egvs.formats import spreadsheets
 from egvs.results.command_entries import DIGEST_KEY, what_if_digest
 from egvs.results.labels import ScoreLabel, format_probability, join_names
 from egvs.results.ranking import RankedSite, Ranking
@@ -441,7 +441,7 @@ def _box_shape(box: WhatIfBox) -> BaseGeometry:
 
 
 def read_vehicles(path: Path, scenario: Scenario) -> list[WhatIfBox]:
-    """Read parked vehicles: a CSV with x_m, y_m (centre, world frame), yaw_deg and type.
+    """Read parked vehicles: a table with x_m, y_m (centre, world frame), yaw_deg and type.
 
     Raises
     ------
@@ -449,16 +449,19 @@ def read_vehicles(path: Path, scenario: Scenario) -> list[WhatIfBox]:
         Naming file, line and value.
     """
     sizes = class_sizes(scenario.traffic)
-    boxes = []
-    for where, row in csv_tables.read_rows(path, partial(_check_vehicle_columns, path)):
+
+    def parse(where: str, row: dict[str, str]) -> Iterator[WhatIfBox]:
         kind = row["type"]
         if kind not in sizes:
             problem = f"expected one of {', '.join(sizes)}, got {kind!r}"
             raise InputError(f"{where}: type", problem, "Use one of these, or add the kind to traffic.kinds.")
-        x_m, y_m, yaw_deg = (_parse(row[name], f"{where}: {name}") for name in VEHICLE_COLUMNS[:3])
+        columns = VEHICLE_COLUMNS[:3]
+        x_m, y_m, yaw_deg = parse_each(columns, lambda name: _parse(row[name], f"{where}: {name}"), "vehicles")
         size = sizes[kind]
         extent = {"length_m": size.length_m, "width_m": size.width_m, "height_m": size.height_m}
-        boxes.append(WhatIfBox(x_m=x_m, y_m=y_m, yaw_deg=yaw_deg, kind=PARKED, **extent))
+        yield WhatIfBox(x_m=x_m, y_m=y_m, yaw_deg=yaw_deg, kind=PARKED, **extent)
+
+    boxes = spreadsheets.parse_rows(path, partial(_check_vehicle_columns, path), parse)
     if not boxes:
         raise InputError(path, "expected at least one vehicle, got none", "Write one row per vehicle.")
     return boxes
@@ -474,7 +477,7 @@ def _check_vehicle_columns(path: Path, header: list[str]) -> list[str]:
 def _parse(text: str, where: str) -> float:
     value = number_or_nan(text, parse_decimal)
     if not abs(value) <= MAX_COORDINATE_M:
-        raise InputError(where, f"expected a number, got {text!r}", DECIMAL_COMMA_HINT)
+        raise InputError(where, f"expected a number, got {text!r}", "Use a number such as 8.5.")
     return value
 
 

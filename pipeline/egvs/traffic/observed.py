@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from egvs.core.errors import InputError, find_misspelling
+from egvs.core.errors import InputError, find_misspelling, parse_each
 from egvs.core.numbers import number_or_nan
-from egvs.formats import csv_tables
+from egvs.formats import spreadsheets
 from egvs.scenario.model import Scenario
 from egvs.traffic.approaches import ApproachIndex
 from egvs.traffic.movements import MovementNames
@@ -64,10 +64,14 @@ def read_observed(scenario: Scenario, network: Network) -> tuple[Observation, ..
 def read_observations(path: Path, index: ApproachIndex, periods: Sequence[str]) -> tuple[Observation, ...]:
     """Read observations; ``periods`` are the names of the scenario's periods, empty without periods."""
     observations: dict[tuple[str, str], Observation] = {}
-    for where, values in csv_tables.read_rows(path, partial(_check_header, path)):
+
+    def parse(where: str, values: Mapping[str, str]) -> tuple[()]:
         observation = _parse_row(where, values, index, periods)
         if observations.setdefault((observation.approach, observation.period), observation) is not observation:
             raise InputError(where, f"two rows for the approach {observation.approach}", "Remove one of the rows.")
+        return ()
+
+    spreadsheets.parse_rows(path, partial(_check_header, path), parse)
     if not observations:
         raise InputError(path, "has no observations", "Add one row per approach below the header.")
     return tuple(observations.values())
@@ -97,7 +101,10 @@ def _parse_row(where: str, values: Mapping[str, str], index: ApproachIndex, peri
     if (period or periods) and period not in periods:
         known = f"Periods: {', '.join(periods)}." if periods else "The scenario has no periods; remove the column."
         raise InputError(f"{where}: period", f"expected a period of the scenario, got {period!r}", known)
-    numbers = {name: _parse_number(f"{where}: {name}", values.get(name, ""), limit) for name, limit in _LIMITS.items()}
+    parsed = parse_each(
+        _LIMITS.items(), lambda item: _parse_number(f"{where}: {item[0]}", values.get(item[0], ""), item[1]), "observed"
+    )
+    numbers = dict(zip(_LIMITS, parsed, strict=True))
     if all(number is None for number in numbers.values()):
         raise InputError(where, "has neither queue_m nor speed_kmh", "Enter one of them.")
     return Observation(title, period, numbers["queue_m"], numbers["speed_kmh"])

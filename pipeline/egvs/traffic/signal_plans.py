@@ -28,7 +28,7 @@ from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan
 from egvs.core.wording import list_first, number_of, shorten_id
-from egvs.formats import csv_tables, xml
+from egvs.formats import spreadsheets, xml
 from egvs.scenario.model import Scenario
 from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
 from egvs.traffic import network
@@ -144,7 +144,7 @@ def _make_program(config: SignalConfig, signal: Signal, scenario: Scenario, wher
         path = scenario.find(config.file, f"{where.partition(': ')[2]}.file")
         if config.is_sumo_file:
             return _read_program(path, config, signal)
-        config = config.model_copy(update={"phases": _read_csv(path, config), "file": None})
+        config = config.model_copy(update={"phases": _read_table(path, config), "file": None})
         where = str(path)
     greens = [_green_links(phase, signal, f"{where}: phase {n}") for n, phase in enumerate(config.phases, start=1)]
     for number, green in enumerate(greens, start=1):
@@ -329,10 +329,11 @@ def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
     return replace(program, offset_s=program.offset_s + config.offset_s)
 
 
-def _read_csv(path: Path, config: SignalConfig) -> tuple[SignalPhaseConfig, ...]:
+def _read_table(path: Path, config: SignalConfig) -> tuple[SignalPhaseConfig, ...]:
     """Read the phases of a plan, in the order in which they first occur."""
     phases: dict[str, dict[str, Any]] = {}
-    for where, row in csv_tables.read_rows(path, partial(_check_header, path)):
+
+    def parse(where: str, row: dict[str, str]) -> tuple[()]:
         values = phases.setdefault(row["phase"], {"green": {}})
         movements = values["green"].setdefault(row["approach"], [])
         movements += row["movement"].split()
@@ -344,6 +345,9 @@ def _read_csv(path: Path, config: SignalConfig) -> tuple[SignalPhaseConfig, ...]
             if values.setdefault(key, number) != number:
                 problem = f"expected {values[key]:g} as before in phase {row['phase']!r}, got {number:g}"
                 raise InputError(f"{where}: {key}", problem, "Use one value for each phase.")
+        return ()
+
+    spreadsheets.parse_rows(path, partial(_check_header, path), parse)
     if not phases:
         raise InputError(path, "expected a phase in each row, got none", _CSV_HINT)
     configs = []

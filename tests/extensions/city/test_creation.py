@@ -216,13 +216,13 @@ def test_radius_limits_streets_and_junctions(extract: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ("tower,50.0,10.05", "junction tower: the nearest junction of three or more streets is"),
+        ("tower,50.0,10.05", "line 2 (tower): the nearest junction of three or more streets is"),
         ("tower,10.0,50.0", "are swapped: did you mean lat_deg 50.0, lon_deg 10.0?"),
-        ("tower,50.0,10.0\nother,50.0,10.00001", "junction other: these coordinates select the same junction as tower"),
-        ("tower,50.0,10.0\nTower,50.0,10.00001", "junction Tower: this name occurs twice"),
-        ("a/b,50.0,10.0", "junction a/b: junction: invalid name 'a/b'"),
+        ("tower,50.0,10.0\nother,50.0,10.00001", "line 3 (other): these coordinates select the same junction as tower"),
+        ("tower,50.0,10.0\nTower,50.0,10.00001", "line 3 (Tower): this name occurs twice"),
+        ("a/b,50.0,10.0", "line 2 (a/b): junction: invalid name 'a/b'"),
         ("", "junctions.csv: the table has no junctions"),
-        ("tower,95,10.0", "junction tower: lat_deg: expected a number from -90 to 90, got '95'"),
+        ("tower,95,10.0", "line 2 (tower): lat_deg: expected a number from -90 to 90, got '95'"),
     ],
 )
 def test_rejects_wrong_row_of_table(extract: Path, tmp_path: Path, rows: str, message: str) -> None:

@@ -28,7 +28,7 @@ from shapely.geometry import Point, box
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core import files
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, parse_each
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import format_percent
 from egvs.creation import assumed_traffic, junctions, new_scenario, scenario_files
@@ -324,16 +324,20 @@ def choose_junctions(streets: Streets, which: str, within: BaseGeometry | None) 
     return JunctionChoice({f"j{number:0{width}d}": junction for number, junction in enumerate(chosen, 1)}, left_out)
 
 
-def _junctions_from_table(streets: Streets, path: Path) -> Iterator[tuple[str, StreetJunction]]:
+def _junctions_from_table(streets: Streets, path: Path) -> list[tuple[str, StreetJunction]]:
     names_by_id: dict[str, str] = {}
-    for where, row in model.read_junction_rows(path, REQUIRED_COLUMNS):
+
+    def find(located: tuple[str, dict[str, str]]) -> tuple[str, StreetJunction]:
+        where, row = located
         lat_deg, lon_deg = model.parse_number(where, row, "lat_deg"), model.parse_number(where, row, "lon_deg")
         junction = _junction_at(streets, lat_deg, lon_deg, where)
         if junction.id in names_by_id:
             problem = f"these coordinates select the same junction as {names_by_id[junction.id]}"
             raise InputError(where, problem, "Use one row per junction.")
         names_by_id[junction.id] = row["junction"]
-        yield row["junction"], junction
+        return row["junction"], junction
+
+    return parse_each(model.read_junction_rows(path, REQUIRED_COLUMNS), find, "junctions")
 
 
 def _junction_at(streets: Streets, lat_deg: float, lon_deg: float, where: str) -> StreetJunction:

@@ -26,9 +26,10 @@ from pathlib import Path
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from egvs.core import limits, reading
-from egvs.core.errors import InputError
+from egvs.core import reading
+from egvs.core.errors import InputError, parse_each
 from egvs.core.numbers import number_or_nan, parse_decimal
+from egvs.formats import spreadsheets
 from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.fields import MAX_COORDINATE_M, NAME_DESCRIPTION, Name, StrictModel
 from egvs.scenario.loading import check_unused_keys, default_name, format_validation_error
@@ -144,7 +145,7 @@ def load_city(folder: str | Path) -> City:
         model.name,
         model.seed,
         model.traffic,
-        tuple(_parse_junction(where, row) for where, row in rows),
+        tuple(parse_each(rows, lambda row: _parse_junction(*row), "junctions")),
         model.attribution,
         model.description,
         model.effects,
@@ -172,45 +173,43 @@ def city_json_schema() -> str:
     return json.dumps(CityModel.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
-def read_junction_rows(path: Path, required: Sequence[str]) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the rows of a table of junctions, each with its location for messages.
+def read_junction_rows(path: Path, required: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
+    """Return the rows of a table of junctions, each with its location for messages.
 
     Parameters
     ----------
     path
-        The CSV file.
+        The table (:mod:`egvs.formats.spreadsheets`).
     required
         Columns that it must have, among them ``junction``; it may have all of :data:`JUNCTION_COLUMNS`.
 
     Raises
     ------
     InputError
-        When the file is missing, is no CSV table with these columns, has no rows, or a junction's name is invalid or
+        When the file is missing, is no table with these columns, has no rows, or a junction's name is invalid or
         occurs twice.
     """
-    hint = f"Use the columns {', '.join(required)}, separated by commas."
+    hint = f"Use the columns {', '.join(required)}."
     if not path.is_file():
-        raise InputError(path, "no such file", f"Give a CSV table of junctions. {hint}")
-    data = limits.read_bytes(path, limits.DOCUMENT)
+        raise InputError(path, "no such file", f"Give a table of junctions. {hint}")
+
+    def check_header(columns: list[str]) -> list[str]:
+        if not set(required) <= set(columns) <= set(JUNCTION_COLUMNS):
+            raise InputError(path, f"the columns are {', '.join(columns)}", hint)
+        return columns
+
     keys = set[str]()
-    try:
-        file = io.StringIO(data.decode("utf-8-sig"), newline="")
-        reader = csv.DictReader(file, skipinitialspace=True, strict=True)
-        columns = list(reader.fieldnames or ())
-        if not set(required) <= set(columns) <= set(JUNCTION_COLUMNS) or len(set(columns)) < len(columns):
-            raise InputError(path, f"the columns are {', '.join(columns) or 'missing'}", hint)
-        for row in reader:
-            where = f"{path}: junction {row.get('junction') or '?'}"
-            if None in row or None in row.values():
-                problem = "has more or fewer values than the header has columns"
-                raise InputError(where, problem, "Give one value per column.")
-            _check_name(where, row["junction"], keys)
-            keys.add(_folder_key(row["junction"]))
-            yield where, row
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, f"cannot be read as CSV ({error})", "Use UTF-8 text with a header row.") from None
+
+    def check_row(where: str, row: dict[str, str]) -> Iterator[tuple[str, dict[str, str]]]:
+        where = f"{where} ({row['junction'] or '?'})"
+        _check_name(where, row["junction"], keys)
+        keys.add(_folder_key(row["junction"]))
+        yield where, row
+
+    rows = spreadsheets.parse_rows(path, check_header, check_row)
     if not keys:
         raise InputError(path, "the table has no junctions", "Add at least one row.")
+    return rows
 
 
 def _folder_key(name: str) -> str:

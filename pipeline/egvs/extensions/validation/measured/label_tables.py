@@ -18,7 +18,7 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan, parse_decimal
-from egvs.formats import csv_tables
+from egvs.formats import spreadsheets
 from egvs.formats.sweep_labels import LabelOptions, SweepLabels, label_class, sweep_name
 
 SIZES = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m")
@@ -53,7 +53,7 @@ def read_labels(path: Path, options: LabelOptions) -> list[SweepLabels]:
                 raise InputError(f"{path}: header", f"expected one of the columns {expected}", _HINT)
         return names
 
-    table = list(csv_tables.read_rows(path, check_header))
+    table = spreadsheets.parse_rows(path, check_header, lambda where, cells: [(where, cells)])
     is_named, is_timed, is_scored = (column[name] in present for name in ("sweep", "time_s", "score"))
     rows: dict[str, list[_Row]] = {}
     for where, cells in table:

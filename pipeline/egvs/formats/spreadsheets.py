@@ -1,0 +1,318 @@
+"""Tables that people type or make in a spreadsheet: CSV in the forms that offices write, and workbooks.
+
+Text is UTF-8, UTF-16 with a byte order mark, or Windows-1252. The first row with values is the header; a first line
+``sep=;`` names the separator, which otherwise is the one of comma, semicolon and tab that the header has most of. Rows
+and columns without any value are skipped, as spreadsheets keep those that were emptied.
+
+``8,5`` is the number 8.5. Where each such cell of a table could also be a number of thousands (``1,500``), the table is
+rejected.
+
+Workbooks (xlsx, xls, ods) are read by calamine (``pip install 'egvs[tables]'``) in another process
+(:mod:`egvs.formats.reader_process`), which this module also is the program of. The values that a spreadsheet has
+computed are read, not the formulas. Of several sheets, one must have the header that is expected.
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from egvs.core import limits, plugins
+from egvs.core.errors import InputError, raise_together
+from egvs.core.wording import list_first
+
+CheckHeader = Callable[[list[str]], list[str]]
+"""Returns the names of columns under which values are given; raises an InputError where they are not valid."""
+
+Parsed = TypeVar("Parsed")
+
+SUFFIXES = (".csv", ".xlsx", ".xls", ".ods")
+MAX_COLUMNS = 500
+_MODULE = "egvs.formats.spreadsheets"
+_WORKBOOK_SIGNATURES = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1")  # ZIP (xlsx, ods), OLE (xls)
+_CONTROL_CHARACTER = re.compile("[\x00-\x08\x0e-\x1f]")
+_SEPARATORS = (",", ";", "\t")
+_SEPARATOR_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
+_COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
+_THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
+_SAVE_HINT = "Save it as CSV in UTF-8."
+_MAX_NAMED = 5
+
+
+@dataclass(frozen=True)
+class TableRows:
+    """The rows of a table below its header.
+
+    Attributes
+    ----------
+    rows
+        Where each row is, for messages, and its values by column, without blanks around them.
+    errors
+        What is wrong with the other rows.
+    """
+
+    rows: list[tuple[str, dict[str, str]]]
+    errors: list[InputError]
+
+
+def parse_rows(
+    path: Path, check_header: CheckHeader, parse: Callable[[str, dict[str, str]], Iterable[Parsed]]
+) -> list[Parsed]:
+    """Parse the rows of a table; the errors of all rows are raised together.
+
+    Parameters
+    ----------
+    path, check_header
+        As in :func:`read_rows`.
+    parse
+        Returns what a row stands for; its arguments are where the row is, for messages, and its values by column.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_rows`, when a row has another number of values than the header, and the errors of ``parse``.
+    """
+    table = read_rows(path, check_header)
+    errors = list(table.errors)
+    parsed: list[Parsed] = []
+    for where, values in table.rows:
+        try:
+            parsed += parse(where, values)
+        except InputError as error:
+            errors.append(error)
+    raise_together(errors, "table")
+    return parsed
+
+
+def read_rows(path: Path, check_header: CheckHeader) -> TableRows:
+    """Return the rows of a CSV file or a workbook that have values.
+
+    Parameters
+    ----------
+    path
+        The file, at most :data:`egvs.core.limits.DOCUMENT`. Lines and rows are counted from 1.
+    check_header
+        Called with the names of the columns; of a workbook, once for each sheet with values.
+
+    Raises
+    ------
+    InputError
+        When the file is too large, is no table, two columns have the same name, or commas in numbers can have two
+        meanings.
+    MissingExtraError
+        For a workbook, if calamine is not installed.
+    """
+    data = limits.read_bytes(path, limits.DOCUMENT)
+    if data.startswith(_WORKBOOK_SIGNATURES):
+        table, header = _choose_sheet(path, list(_read_workbook(path)), check_header)
+    else:
+        table = _read_text(path, data)
+        header = check_header(table.header)
+    for name in header:
+        if header.count(name) > 1:
+            raise InputError(f"{table.where}: header", f"two columns are called {name!r}", "Rename or remove one.")
+    _use_decimal_points(table)
+    rows = [(table.locate(number), dict(zip(header, cells, strict=True))) for number, cells in table.rows]
+    return TableRows(rows, table.errors)
+
+
+# ---- cells
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A table with its header and, by their numbers, the rows that have values; columns without a name are left out."""
+
+    where: str
+    unit: str
+    header: list[str]
+    rows: list[tuple[int, list[str]]]
+    errors: list[InputError]
+
+    def locate(self, number: int) -> str:
+        return f"{self.where}: {self.unit} {number}"
+
+
+def _make_table(where: str, unit: str, rows: Iterable[tuple[int, list[str]]]) -> _Table:
+    """Return a table of the rows that have values, without columns that have none."""
+    rows = [(number, [cell.strip() for cell in cells]) for number, cells in rows]
+    rows = [(number, cells) for number, cells in rows if any(cells)]
+    if not rows:
+        raise InputError(where, "expected a header and rows, got no values", "Write one row per item.")
+    header = rows.pop(0)[1]
+    if len(header) > MAX_COLUMNS:
+        problem = f"expected at most {MAX_COLUMNS} columns, got {len(header):,}"
+        raise InputError(where, problem, "Remove columns that are not needed.")
+    used = {column for _, cells in rows for column, cell in enumerate(cells) if cell}
+    for column in sorted(used):
+        if column < len(header) and not header[column]:
+            number, value = next((n, cells[column]) for n, cells in rows if len(cells) > column and cells[column])
+            problem = f"column {column + 1} has no name, but {unit} {number} has the value {value[:80]!r} there"
+            raise InputError(f"{where}: header", problem, "Name or remove the column.")
+    columns = [column for column, name in enumerate(header) if name]
+    table = _Table(where, unit, [header[column] for column in columns], [], [])
+    for number, cells in rows:
+        if len(cells) > columns[-1] and not any(cells[len(header) :]):
+            table.rows.append((number, [cells[column] for column in columns]))
+        else:
+            problem = f"expected {columns[-1] + 1} values, got {len(cells)}"
+            hint = "Check the separators, and the quotes around values with one."
+            table.errors.append(InputError(table.locate(number), problem, hint))
+    return table
+
+
+def _use_decimal_points(table: _Table) -> None:
+    """Replace decimal commas by points; InputError where each of them could separate thousands."""
+    with_comma = [
+        (number, column, cells)
+        for number, cells in table.rows
+        for column, cell in enumerate(cells)
+        if "," in cell and _COMMA_NUMBER.fullmatch(cell)
+    ]
+    if with_comma and all(_THOUSANDS.fullmatch(cells[column]) for _, column, cells in with_comma):
+        number, column, cells = with_comma[0]
+        value = cells[column]
+        problem = f"{value} can mean {value.replace(',', '')} or {value.replace(',', '.')}"
+        where = f"{table.locate(number)}: {table.header[column]}"
+        raise InputError(where, problem, "Use no separators of thousands, and a decimal point.")
+    for _, column, cells in with_comma:
+        cells[column] = cells[column].replace(",", ".")
+
+
+# ---- text
+
+
+def _read_text(path: Path, data: bytes) -> _Table:
+    text = _decode(path, data)
+    first_line, _, rest = text.partition("\n")
+    skipped = 0
+    named = _SEPARATOR_LINE.fullmatch(first_line.strip(" \r"))
+    if named is not None:
+        text, skipped, separator = rest, 1, named[1]
+    else:
+        header = next((line for line in text.splitlines() if line.strip(" ,;\t")), "")
+        separator = max(_SEPARATORS, key=header.count)
+        if "|" in header and not header.count(separator):
+            raise InputError(path, "the columns are separated by '|'", "Use commas or semicolons.")
+    table = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True, strict=True)
+    try:
+        rows = [(table.line_num + skipped, cells) for cells in table]
+    except csv.Error as error:
+        line = table.line_num + skipped
+        raise InputError(f"{path}: line {line}", f"is not CSV ({error})", "Check the quotes.") from None
+    return _make_table(str(path), "line", rows)
+
+
+def _decode(path: Path, data: bytes) -> str:
+    encoding = "utf-16" if data.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
+    try:
+        text = data.decode(encoding)
+    except UnicodeDecodeError as error:
+        try:
+            text = data.decode("cp1252")
+        except UnicodeDecodeError:
+            text = "\0"
+        if encoding == "utf-16" or _CONTROL_CHARACTER.search(text):
+            raise InputError(path, f"is no text in a known encoding (byte {error.start})", _SAVE_HINT) from None
+    if control := _CONTROL_CHARACTER.search(text):
+        raise InputError(path, f"is no text: it has the control character {control[0]!r}", _SAVE_HINT)
+    return text
+
+
+# ---- workbooks
+
+
+def _choose_sheet(path: Path, sheets: list[_Table], check_header: CheckHeader) -> tuple[_Table, list[str]]:
+    """Return the only sheet with values, or the only one with a valid header; and that header."""
+    if not sheets:
+        raise InputError(path, "expected a table, got a workbook without values", "Write one row per item.")
+    if len(sheets) == 1:
+        return sheets[0], check_header(sheets[0].header)
+    accepted = []
+    errors = []
+    for sheet in sheets:
+        try:
+            accepted.append((sheet, check_header(sheet.header)))
+        except InputError as error:
+            errors.append(error)
+    if not accepted:
+        raise_together(errors, "table")
+    if len(accepted) > 1:
+        names = list_first([sheet.where.removeprefix(f"{path}: sheet ") for sheet, _ in accepted], _MAX_NAMED)
+        problem = f"expected one sheet with this kind of table, got {len(accepted)} ({names})"
+        raise InputError(path, problem, "Keep one of them, or save it as CSV.")
+    return accepted[0]
+
+
+def _read_workbook(path: Path) -> Iterator[_Table]:
+    """Yield the visible sheets that have values."""
+    plugins.require_libraries(f"{path.name}: reading a workbook", "tables", "python_calamine")
+    from egvs.formats.reader_process import read_blocks
+
+    sheets: dict[str, list[tuple[int, list[str]]]] = {}
+    size = 0
+    for block in read_blocks(_MODULE, path, str(path), "cannot be read as a workbook"):
+        size += len(block.content)
+        limits.DOCUMENT.check_bytes(path, size, f"has tables of {size / limits.MB:,.0f} MB")
+        sheets.setdefault(block.values["sheet"], []).append((block.values["row"], json.loads(bytes(block.content))))
+    for name, rows in sheets.items():
+        where = str(path) if len(sheets) == 1 else f"{path}: sheet {name!r}"
+        yield _make_table(where, "row", rows)
+
+
+def _serve_workbook() -> None:
+    from python_calamine import CalamineWorkbook, SheetTypeEnum, SheetVisibleEnum
+
+    from egvs.formats.reader_process import Block, serve
+
+    def read(path: Path) -> Iterator[Block]:
+        book = CalamineWorkbook.from_path(path)
+        for sheet in book.sheets_metadata:
+            if sheet.visible != SheetVisibleEnum.Visible or sheet.typ != SheetTypeEnum.WorkSheet:
+                continue
+            content = book.get_sheet_by_name(sheet.name)
+            if content.start is None or content.end is None:
+                continue
+            columns = content.end[1] + 1 - content.start[1]
+            if columns > MAX_COLUMNS:
+                problem = f"expected at most {MAX_COLUMNS} columns, got {columns:,}"
+                raise InputError(f"{path}: sheet {sheet.name!r}", problem, "Remove columns that are not needed.")
+            rows = enumerate(content.iter_rows(), start=content.start[0] + 1)
+            for number, cells in rows:
+                texts = [_cell_text(cell) for cell in cells]
+                if any(texts):
+                    yield Block({"sheet": sheet.name, "row": number}, json.dumps(texts).encode())
+
+    serve(read)
+
+
+def _cell_text(value: object) -> str:
+    """Return a cell as it would be written in CSV."""
+    match value:
+        case bool():
+            return str(value).lower()
+        case float() if value.is_integer() and abs(value) < 1e15:
+            return str(int(value))
+        case datetime.timedelta():
+            minutes, seconds = divmod(round(value.total_seconds()), 60)
+            return _clock_text(minutes // 60, minutes % 60, seconds)
+        case datetime.datetime() | datetime.date():
+            return value.isoformat()
+        case datetime.time():
+            return _clock_text(value.hour, value.minute, value.second)
+    return str(value)
+
+
+def _clock_text(hours: int, minutes: int, seconds: int) -> str:
+    return f"{hours:02d}:{minutes:02d}" + (f":{seconds:02d}" if seconds else "")
+
+
+if __name__ == "__main__":
+    _serve_workbook()

@@ -1,0 +1,82 @@
+"""Small workbooks (xlsx, ods), written as spreadsheet programs write them."""
+
+from __future__ import annotations
+
+import datetime
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from xml.sax.saxutils import escape, quoteattr
+
+Cell = str | float | bool | datetime.time | None
+Rows = Sequence[Sequence[Cell]]
+
+_TYPES = "http://schemas.openxmlformats.org/package/2006/content-types"
+_MAIN = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
+_LINKS = "http://schemas.openxmlformats.org/officeDocument/2006/relationships"
+_PACKAGE = "http://schemas.openxmlformats.org/package/2006/relationships"
+_MANIFEST = "<manifest xmlns='urn:oasis:names:tc:opendocument:xmlns:manifest:1.0'/>"
+_STYLES = f'<styleSheet xmlns="{_MAIN}"><cellXfs><xf numFmtId="0"/><xf numFmtId="20"/></cellXfs></styleSheet>'  # h:mm
+
+
+def write_xlsx(path: Path, sheets: Mapping[str, Rows], hidden: Sequence[str] = ()) -> None:
+    """Write the sheets of a workbook; times of the day have the format h:mm."""
+    names = list(sheets)
+    entries = "".join(
+        f"<sheet name={quoteattr(name)} state='{'hidden' if name in hidden else 'visible'}' sheetId='{n}' r:id='s{n}'/>"
+        for n, name in enumerate(names)
+    )
+    links = "".join(
+        f"<Relationship Id='s{n}' Type='{_LINKS}/worksheet' Target='sheet{n}.xml'/>" for n in range(len(names))
+    )
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("[Content_Types].xml", f"<Types xmlns='{_TYPES}'/>")
+        office = f"<Relationship Id='w' Type='{_LINKS}/officeDocument' Target='xl/workbook.xml'/>"
+        archive.writestr("_rels/.rels", f"<Relationships xmlns='{_PACKAGE}'>{office}</Relationships>")
+        workbook = f"<workbook xmlns='{_MAIN}' xmlns:r='{_LINKS}'><sheets>{entries}</sheets></workbook>"
+        archive.writestr("xl/workbook.xml", workbook)
+        links += f"<Relationship Id='t' Type='{_LINKS}/styles' Target='styles.xml'/>"
+        archive.writestr("xl/_rels/workbook.xml.rels", f"<Relationships xmlns='{_PACKAGE}'>{links}</Relationships>")
+        archive.writestr("xl/styles.xml", _STYLES)
+        for n, name in enumerate(names):
+            rows = "".join(
+                f"<row r='{r}'>{''.join(_xlsx_cell(cell, r, c) for c, cell in enumerate(cells))}</row>"
+                for r, cells in enumerate(sheets[name], start=1)
+            )
+            archive.writestr(
+                f"xl/sheet{n}.xml", f"<worksheet xmlns='{_MAIN}'><sheetData>{rows}</sheetData></worksheet>"
+            )
+
+
+def _xlsx_cell(value: Cell, row: int, column: int) -> str:
+    where = f"r='{chr(65 + column)}{row}'"
+    match value:
+        case None:
+            return ""
+        case bool():
+            return f"<c {where} t='b'><v>{int(value)}</v></c>"
+        case str():
+            return f"<c {where} t='inlineStr'><is><t>{escape(value)}</t></is></c>"
+        case datetime.time():
+            return f"<c {where} s='1'><v>{(value.hour * 60 + value.minute) / 1440!r}</v></c>"
+    return f"<c {where}><v>{value!r}</v></c>"
+
+
+def write_ods(path: Path, rows: Rows) -> None:
+    """Write a workbook with one sheet of texts and numbers."""
+    lines = "".join(f"<table:table-row>{''.join(map(_ods_cell, cells))}</table:table-row>" for cells in rows)
+    names = {name: f"urn:oasis:names:tc:opendocument:xmlns:{name}:1.0" for name in ("office", "table", "text")}
+    spaces = " ".join(f"xmlns:{name}='{uri}'" for name, uri in names.items())
+    sheet = f"<office:spreadsheet><table:table table:name='a'>{lines}</table:table></office:spreadsheet>"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("mimetype", "application/vnd.oasis.opendocument.spreadsheet")
+        archive.writestr("META-INF/manifest.xml", _MANIFEST)
+        content = f"<office:document-content {spaces}><office:body>{sheet}</office:body></office:document-content>"
+        archive.writestr("content.xml", content)
+
+
+def _ods_cell(value: Cell) -> str:
+    if isinstance(value, str):
+        text = f"<text:p>{escape(value)}</text:p>"
+        return f"<table:table-cell office:value-type='string'>{text}</table:table-cell>"
+    return f"<table:table-cell office:value-type='float' office:value='{value!r}'/>"
