@@ -87,7 +87,7 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         keeps_type=_import_all if options.walk else is_driving,
     )
     with files.temporary_folder() as folder:
-        write_copy(path, folder / _MAP, copy_options)
+        write_copy(path, road_map, folder / _MAP, copy_options)
         copied = _read_copy(folder / _MAP, path)
         if lefthand and not is_lefthand_map:
             _check_lefthand(road_map, copied, path)
