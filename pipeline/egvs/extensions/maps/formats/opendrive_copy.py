@@ -18,7 +18,7 @@ from typing import IO
 from xml.etree.ElementTree import Element, tostring
 
 from egvs.extensions.maps.formats.direct_junctions import replace_direct_connections
-from egvs.extensions.maps.formats.opendrive import OpenDriveMap
+from egvs.extensions.maps.formats.opendrive import OpenDriveMap, Road
 from egvs.formats import xml
 
 _ROAD_PARTS = frozenset({"link", "type", "planView", "elevationProfile", "lanes", "signals"})
@@ -42,12 +42,15 @@ class CopyOptions:
         Whether the ids of lanes change their sign.
     keeps_type
         Whether a lane of this type is imported.
+    keeps_all_lights
+        Whether traffic lights that are at no junction, such as those of pedestrian crossings, are kept.
     """
 
     reference: str
     rotation_rad: float
     swap_lanes: bool
     keeps_type: Callable[[str], bool]
+    keeps_all_lights: bool
 
 
 def write_copy(path: Path, road_map: OpenDriveMap, to: Path, options: CopyOptions) -> None:
@@ -60,7 +63,9 @@ def write_copy(path: Path, road_map: OpenDriveMap, to: Path, options: CopyOption
             if element.tag not in _PARTS:
                 continue
             added = []
-            if element.tag == "junction":
+            if element.tag == "road" and not options.keeps_all_lights:
+                _remove_other_lights(element, road_map.roads[element.attrib["id"]])
+            elif element.tag == "junction":
                 added = replace_direct_connections(element, road_map, lefthand=options.swap_lanes)
             for part in (element, *added):
                 _change(part, options)
@@ -83,6 +88,14 @@ def _change(element: Element, options: CopyOptions) -> None:
             for link in element.iter("laneLink"):
                 _negate(link, "from")
                 _negate(link, "to")
+
+
+def _remove_other_lights(element: Element, road: Road) -> None:
+    """Remove the traffic lights of a ``<road>`` that are at no junction."""
+    for signals in element.iterfind("signals"):
+        for child, signal in zip(list(signals.iterfind("signal")), road.signals, strict=True):
+            if road.is_light_elsewhere(signal):
+                signals.remove(child)
 
 
 def _change_header(header: Element, options: CopyOptions) -> None:
