@@ -184,10 +184,8 @@ def direct_junction(*, lefthand: bool = False, both_ways: bool = False) -> str:
     return opendrive(
         road("1", 100, geometry(0, 0, 0, 100), lanes(side, 2 * side, *back), "successor junction 9", rule=rule),
         road("2", 100, geometry(100, 0, 0, 100), lanes(side, *back), "predecessor junction 9", rule=rule),
-        road("3", 100, geometry(100, 3.5 * side, side * 0.05, 100), lanes(side), "predecessor junction 9", rule=rule),
-        connections.replace('<junction id="9"', '<junction id="9" type="direct"').replace(
-            "connectingRoad", "linkedRoad"
-        ),
+        road("3", 100, oblique, lanes(side), "predecessor junction 9", rule=rule),
+        joined,
     )
 
 
