@@ -162,3 +162,68 @@ def roundabout() -> str:
         junction("8", ("4", "30", "start", "-1:-1"), ("4", "31", "start", "-1:-1"), ("1", "32", "start", "1:-1")),
         junction("9", ("3", "40", "start", "-1:-1"), ("3", "41", "start", "-1:-1"), ("2", "42", "start", "1:-1")),
     )  # fmt: skip
+
+
+def direct_junction(*, lefthand: bool = False, both_ways: bool = False) -> str:
+    """Road 1 leads to roads 2 and 3 end to end; with ``both_ways``, another lane leads from road 2 back to road 1."""
+    side = 1 if lefthand else -1
+    rule = "LHT" if lefthand else "RHT"
+
+    def lanes(*numbers: int) -> str:
+        right = [lane(number) for number in sorted(numbers, reverse=True) if number < 0]
+        left = [lane(number) for number in sorted(numbers, reverse=True) if number > 0]
+        return section(right, left)
+
+    back = [-side] if both_ways else []
+    links = f"{side}:{side}" + (f" {-side}:{-side}" if both_ways else "")
+    joined = junction("9", ("1", "2", "start", links), ("1", "3", "start", f"{2 * side}:{side}"))
+    joined = joined.replace('<junction id="9"', '<junction id="9" type="direct"').replace(
+        "connectingRoad", "linkedRoad"
+    )
+    oblique = geometry(100, 3.5 * side, side * 0.05, 100)
+    return opendrive(
+        road("1", 100, geometry(0, 0, 0, 100), lanes(side, 2 * side, *back), "successor junction 9", rule=rule),
+        road("2", 100, geometry(100, 0, 0, 100), lanes(side, *back), "predecessor junction 9", rule=rule),
+        road("3", 100, oblique, lanes(side), "predecessor junction 9", rule=rule),
+        joined,
+    )
+
+
+def spirals(curvature: float, change: float, length: float = 60.0) -> str:
+    """A road of one lane along a spiral whose curvature changes by so much, and a road that continues it."""
+    shape = f'<spiral curvStart="{curvature!r}" curvEnd="{curvature + change!r}"/>'
+    first = section([lane(-1, link="successor -1")])
+    angle = (curvature + change / 2) * length
+    x, y = (math.sin(angle) / curvature, (1 - math.cos(angle)) / curvature) if curvature else (length, 0.0)
+    second = section([lane(-1, link="predecessor -1")])
+    return opendrive(
+        road("1", length, geometry(0, 0, 0, length, shape), first, "successor road 2 start"),
+        road("2", 100, geometry(x, y, angle, 100), second, "predecessor road 1 end"),
+    )
+
+
+def crossing_in_pieces(light: str) -> str:
+    """A crossing of four arms; each arm is two roads, and has a light at its end at the junction 9.
+
+    Roads 1 to 4 begin at the junction; 11 to 14 begin where these end.
+    """
+    near = section([lane(-1, link="successor -1")], [lane(1, link="successor 1")])
+    far = section([lane(-1, link="predecessor -1")], [lane(1, link="predecessor 1")])
+    parts, connections = [], []
+    for arm in range(4):
+        heading = arm * math.pi / 2
+        cos, sin = math.cos(heading), math.sin(heading)
+        link = f"predecessor junction 9, successor road {11 + arm} start"
+        start = geometry(10 * cos, 10 * sin, heading, 50)
+        parts.append(road(f"{1 + arm}", 50, start, near, link, signals=light.format(arm)))
+        further = geometry(60 * cos, 60 * sin, heading, 50)
+        parts.append(road(f"{11 + arm}", 50, further, far, f"predecessor road {1 + arm} end"))
+    through = section([lane(-1, link="predecessor 1, successor -1")])
+    for arm in range(4):
+        heading = arm * math.pi / 2 + math.pi
+        opposite = (arm + 2) % 4
+        x, y = -10 * math.cos(heading), -10 * math.sin(heading)
+        link = f"predecessor road {1 + arm} start, successor road {1 + opposite} start"
+        parts.append(road(f"{21 + arm}", 20, geometry(x, y, heading, 20), through, link, junction="9"))
+        connections.append((f"{1 + arm}", f"{21 + arm}", "start", "1:-1"))
+    return opendrive(*parts, junction("9", *connections))

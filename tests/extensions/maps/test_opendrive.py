@@ -189,7 +189,23 @@ def test_signals_become_lights_and_signs_are_counted(tmp_path: Path) -> None:
     # a light at the end of a road that leads nowhere
     alone = road("1", 100, geometry(0, 0, 0, 100), section([lane(-1), lane(-2)]), signals=light)
     road_map, roads = convert(tmp_path, maps.opendrive(alone))
+    assert any("Traffic lights at no junction" in note and "on road 1." in note for note in road_map.notes)
+    assert roads.cycle_s == 0
+    road_map, roads = convert(tmp_path, maps.opendrive(alone), walk=True)
     assert "Traffic lights of these roads have no effect: 1." in road_map.notes and roads.cycle_s == 0
+
+
+@pytest.mark.system
+def test_one_junction_in_pieces_is_one_signal(tmp_path: Path) -> None:
+    """Each arm consists of two roads, with lights of cars and of people where it meets the junction."""
+    car = '<signal id="c{0}" s="0" t="5" dynamic="yes" orientation="-" type="1000001" subtype="-1"/>'
+    people = (
+        '<signal id="p{0}" s="0" t="5" dynamic="yes" orientation="-" type="1000002" subtype="-1">'
+        '<validity fromLane="0" toLane="0"/></signal>'
+    )
+    elsewhere = car.replace('orientation="-"', 'orientation="+"').replace('s="0"', 's="49"').replace("c{0}", "m{0}")
+    _, roads = convert(tmp_path, maps.crossing_in_pieces(car + people + elsewhere))
+    assert [junction.id for junction in roads.junctions if junction.type == "traffic_light"] == ["9"]
 
 
 @pytest.mark.system
@@ -436,3 +452,49 @@ def test_town01_keeps_all_lanes_and_turns(tmp_path: Path) -> None:
     assert "52 of 52 lanes for vehicles and 88 of 88 turns" in " ".join(walking.notes)
     assert sum(lane.is_pavement for lane in lanes(with_sidewalks).values()) == 52
     assert with_sidewalks.walkways.crossings > 30
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("lefthand", [False, True])
+@pytest.mark.parametrize("both_ways", [False, True])
+def test_lanes_of_direct_junctions_lead_to_each_other(tmp_path: Path, lefthand: bool, both_ways: bool) -> None:
+    road_map, roads = convert(tmp_path, maps.direct_junction(lefthand=lefthand, both_ways=both_ways))
+    leads = {(source, target) for source, _, target, _ in turns(roads) if source.strip("-") != target.strip("-")}
+    expected = {("-1", "-2"), ("-1", "-3")} | ({("2", "1")} if both_ways else set())
+    assert leads == expected
+    lanes_made, turns_made = (6, 3) if both_ways else (4, 2)
+    assert (
+        f"{lanes_made} of {lanes_made} lanes for vehicles and {turns_made} of {turns_made} turns" in road_map.notes[0]
+    )
+    assert not any("off the map" in note for note in road_map.notes)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize("curvature", [0.0, 0.02, 0.069])
+@pytest.mark.parametrize("change", [-1e-17, 1e-14, 1e-9, 1e-6])
+def test_spirals_that_are_hardly_bent(tmp_path: Path, curvature: float, change: float) -> None:
+    """netconvert divides by the change of curvature; the middle of the lane is that of the arc, to 2 cm."""
+    road_map, roads = convert(tmp_path, maps.spirals(curvature, change))
+    assert "2 of 2 lanes for vehicles and 1 of 1 turns" in road_map.notes[0]
+    assert not any("off the map" in note for note in road_map.notes)
+    assert roads.location is not None
+    shape = lanes(roads)["-1_0"].shape_m[:, :2] - roads.location.offset_m
+    if curvature:
+        offset_m = np.hypot(shape[:, 0], shape[:, 1] - 1 / curvature) - (1 / curvature + 1.75)
+    else:
+        offset_m = shape[:, 1] + 1.75
+    assert np.abs(offset_m).max() < 0.02
+
+
+@pytest.mark.system
+def test_light_where_two_roads_join_is_none(tmp_path: Path) -> None:
+    """It governs no conflicting movements; netconvert would stop cars at the joint, and at the end of the road."""
+    light = '<signal id="s1" s="98" t="5" dynamic="yes" orientation="+" type="1000001" subtype="-1"/>'
+    road_map, roads = convert(tmp_path, maps.opendrive(*maps.two_roads(signals=light)))
+    assert not any(junction.type == "traffic_light" for junction in roads.junctions)
+    assert roads.cycle_s == 0
+    assert any(
+        "Traffic lights at no junction, such as those of pedestrian crossings, are left out (--walk keeps them),"
+        " on roads 1, 2." in note
+        for note in road_map.notes
+    )

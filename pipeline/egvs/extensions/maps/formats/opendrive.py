@@ -198,12 +198,16 @@ class LaneSection:
 
 @dataclass(frozen=True)
 class RoadSignal:
-    """A signal or sign beside a road; ``dynamic`` for traffic lights."""
+    """A signal or sign beside a road; ``dynamic`` for traffic lights.
+
+    ``orientation`` is ``+`` for traffic along the road, ``-`` for traffic against it, ``none`` for both.
+    """
 
     id: str
     s_m: float
     dynamic: bool
     type: str
+    orientation: str = "none"
 
 
 @dataclass(frozen=True)
@@ -245,6 +249,14 @@ class Road:
     lane_offsets: tuple[Cubic, ...]
     sections: tuple[LaneSection, ...]
     signals: tuple[RoadSignal, ...]
+
+    def is_light_elsewhere(self, signal: RoadSignal) -> bool:
+        """Return whether a signal is a traffic light for traffic towards an end that is at no junction."""
+        ends = {"+": (self.successor,), "-": (self.predecessor,)}.get(
+            signal.orientation, (self.successor, self.predecessor)
+        )
+        is_at_junction = bool(self.junction) or any(link is not None and link.kind == "junction" for link in ends)
+        return signal.dynamic and not is_at_junction
 
     def reference_line(self, s_m: FloatArray) -> FloatArray:
         """Return x, y and heading (n, 3) of the reference line at distances (n,), in metres and rad."""
@@ -513,7 +525,8 @@ def _parse_mark(element: Element, lane: int) -> RoadMark:
 
 def _parse_signal(element: Element) -> RoadSignal:
     dynamic = element.get("dynamic", "no") == "yes"
-    return RoadSignal(element.get("id", ""), _number(element, "s"), dynamic, element.get("type", ""))
+    orientation = element.get("orientation", "none")
+    return RoadSignal(element.get("id", ""), _number(element, "s"), dynamic, element.get("type", ""), orientation)
 
 
 def _parse_connections(junction: Element) -> Iterator[JunctionConnection]:

@@ -2,8 +2,10 @@
 
 netconvert (1.28) knows a projection only as a PROJ string with ``+proj=``; ignores the heading of the header's offset;
 imports parking and other lanes that no traffic uses; takes lanes in their order, whatever their ids; and, for left-hand
-traffic, expects the ids of lanes of right-hand traffic, which it draws on the other side of the reference line. What it
-need not know is left out.
+traffic, expects the ids of lanes of right-hand traffic, which it draws on the other side of the reference line. It
+divides by the curvature of an arc, and by the change of curvature along a spiral: where these are so small that the
+shape differs from a line or an arc by less than :data:`_SAME_SHAPE_M`, the simpler shape is written. It reads no direct
+junctions (:mod:`egvs.extensions.maps.formats.direct_junctions`). What it need not know is left out.
 """
 
 from __future__ import annotations
@@ -15,11 +17,14 @@ from pathlib import Path
 from typing import IO
 from xml.etree.ElementTree import Element, tostring
 
+from egvs.extensions.maps.formats.direct_junctions import replace_direct_connections
+from egvs.extensions.maps.formats.opendrive import OpenDriveMap, Road
 from egvs.formats import xml
 
 _ROAD_PARTS = frozenset({"link", "type", "planView", "elevationProfile", "lanes", "signals"})
 _PARTS = frozenset({"header", "road", "junction", "controller"})
 _IGNORED_TYPE = "none"
+_SAME_SHAPE_M = 1e-3
 _SWAPPED_CHANGES = {"increase": "decrease", "decrease": "increase"}
 
 
@@ -37,24 +42,34 @@ class CopyOptions:
         Whether the ids of lanes change their sign.
     keeps_type
         Whether a lane of this type is imported.
+    keeps_all_lights
+        Whether traffic lights that are at no junction, such as those of pedestrian crossings, are kept.
     """
 
     reference: str
     rotation_rad: float
     swap_lanes: bool
     keeps_type: Callable[[str], bool]
+    keeps_all_lights: bool
 
 
-def write_copy(path: Path, to: Path, options: CopyOptions) -> None:
+def write_copy(path: Path, road_map: OpenDriveMap, to: Path, options: CopyOptions) -> None:
     """Write a copy of a map that :func:`egvs.extensions.maps.formats.opendrive.read_opendrive` has read."""
     with to.open("wb") as file:
         file.write(b'<?xml version="1.0" encoding="UTF-8"?>\n<OpenDRIVE>\n')
         for element in xml.iter_elements(path, ""):
             for inner in element.iter():
                 inner.tag = inner.tag.rpartition("}")[2]
-            if element.tag in _PARTS:
-                _change(element, options)
-                _write(element, file)
+            if element.tag not in _PARTS:
+                continue
+            added = []
+            if element.tag == "road" and not options.keeps_all_lights:
+                _remove_other_lights(element, road_map.roads[element.attrib["id"]])
+            elif element.tag == "junction":
+                added = replace_direct_connections(element, road_map, lefthand=options.swap_lanes)
+            for part in (element, *added):
+                _change(part, options)
+                _write(part, file)
         file.write(b"</OpenDRIVE>\n")
 
 
@@ -73,6 +88,14 @@ def _change(element: Element, options: CopyOptions) -> None:
             for link in element.iter("laneLink"):
                 _negate(link, "from")
                 _negate(link, "to")
+
+
+def _remove_other_lights(element: Element, road: Road) -> None:
+    """Remove the traffic lights of a ``<road>`` that are at no junction."""
+    for signals in element.iterfind("signals"):
+        for child, signal in zip(list(signals.iterfind("signal")), road.signals, strict=True):
+            if road.is_light_elsewhere(signal):
+                signals.remove(child)
 
 
 def _change_header(header: Element, options: CopyOptions) -> None:
@@ -98,12 +121,31 @@ def _change_road(road: Element, options: CopyOptions) -> None:
     for lane in road.iter("lane"):
         if not options.keeps_type(lane.get("type", _IGNORED_TYPE)):
             lane.set("type", _IGNORED_TYPE)
-    if options.rotation_rad:
-        for geometry in road.iter("geometry"):
+    for geometry in road.iter("geometry"):
+        _simplify(geometry)
+        if options.rotation_rad:
             _rotate(geometry, options.rotation_rad)
     if options.swap_lanes:
         _swap_lanes(road)
     _sort_lanes(road)
+
+
+def _simplify(geometry: Element) -> None:
+    """Replace a spiral by an arc, and an arc by a line, that end at most :data:`_SAME_SHAPE_M` from it."""
+    for shape in list(geometry):
+        if shape.tag not in ("arc", "spiral"):
+            continue
+        square_m2 = float(geometry.attrib["length"]) ** 2
+        keys = ("curvature", "curvature") if shape.tag == "arc" else ("curvStart", "curvEnd")
+        first, last = (float(shape.attrib[key]) for key in keys)
+        if abs(last - first) * square_m2 / 12 > _SAME_SHAPE_M:
+            continue
+        curvature = (first + last) / 2
+        shape.attrib.clear()
+        shape.tag = "line"
+        if abs(curvature) * square_m2 / 2 > _SAME_SHAPE_M:
+            shape.tag = "arc"
+            shape.set("curvature", repr(curvature))
 
 
 def _rotate(geometry: Element, angle_rad: float) -> None:

@@ -85,9 +85,10 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         rotation_rad=road_map.offset_rad if reference else 0.0,
         swap_lanes=lefthand,
         keeps_type=_import_all if options.walk else is_driving,
+        keeps_all_lights=options.walk,
     )
     with files.temporary_folder() as folder:
-        write_copy(path, folder / _MAP, copy_options)
+        write_copy(path, road_map, folder / _MAP, copy_options)
         copied = _read_copy(folder / _MAP, path)
         if lefthand and not is_lefthand_map:
             _check_lefthand(road_map, copied, path)
@@ -103,6 +104,8 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         if name != _NETWORK:
             after = compare_with_map(read_made_network(folder / name), copied, mirrored=lefthand)
         notes += (*_patch_notes(comparison, after), *comparison_notes(after, road_map))
+        if not options.walk:
+            notes += _light_notes(road_map)
         text = (folder / name).read_text(encoding="utf-8")
         changes = find_forbidden_changes(read_made_network(folder / name), copied, mirrored=lefthand)
     text = forbid_changes(text, changes, lefthand=lefthand)
@@ -252,6 +255,17 @@ def _patch_notes(before: MapComparison, after: MapComparison) -> tuple[str, ...]
             f" {by_number(len(removed), 'was', 'were')} removed."
         )
     return tuple(notes)
+
+
+def _light_notes(road_map: OpenDriveMap) -> tuple[str, ...]:
+    """Return a sentence on the traffic lights that are not in the copy."""
+    roads = [road.id for road in road_map.roads.values() if any(map(road.is_light_elsewhere, road.signals))]
+    if not roads:
+        return ()
+    return (
+        "Traffic lights at no junction, such as those of pedestrian crossings, are left out (--walk keeps them), on"
+        f" {by_number(len(roads), 'road', 'roads')} {_listed(roads)}.",
+    )
 
 
 def _lane_change_notes(changes: ForbiddenChanges) -> tuple[str, ...]:
