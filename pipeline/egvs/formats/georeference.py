@@ -7,7 +7,7 @@ The world frame is right-handed, x east, y north, in metres. Its position on the
 
 Every pair is in the order x, y: easting before northing, longitude before latitude, whatever the order of the axes in a
 coordinate reference system. Degrees are WGS 84 unless a file declares another datum. PROJ (https://proj.org) does the
-work, through pyproj; no other module imports it.
+work, through pyproj; beside this module, only :mod:`egvs.formats.geotiff_keys` imports it.
 
 The coordinates of a file are metres of the world frame, degrees, or in the system that the file declares. Nothing is
 inferred from the numbers. They only reveal mistakes: a file is rejected when it lies far from the region of interest,
@@ -205,7 +205,9 @@ def _shorten(text: str) -> str:
 def _no_conversion_error(crs: CRS, error: Exception) -> InputError:
     """Return the error, without a location, for a system whose coordinates PROJ cannot convert."""
     problem = f"PROJ cannot convert coordinates from or to {_shown_name(crs)!r}"
-    grids = re.findall(r"\+nadgrids=([^\s\"']+)", crs.srs) or re.findall(r'PARAMETERFILE\["[^"]*","([^"]+)"', crs.to_wkt())
+    grids = re.findall(r"\+nadgrids=([^\s\"']+)", crs.srs) or re.findall(
+        r'PARAMETERFILE\["[^"]*","([^"]+)"', crs.to_wkt()
+    )
     if grids:
         problem += f": the grid {grids[0]} is not installed"
         return InputError("", problem, "Name the system by its EPSG code, or install the grid with projsync.")
@@ -311,7 +313,7 @@ def _transformer(source: str, target: str) -> Transformer:
 
 def _make_transformer(source: Any, target: Any) -> Transformer:
     from pyproj import Transformer
-    from pyproj.network import set_network_enabled
+    from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
 
     set_network_enabled(False)  # PROJ would download grids, if the environment says so
     return Transformer.from_crs(source, target, always_xy=True)
@@ -434,7 +436,7 @@ class Georeference:
             if distance_m <= COUNTRY_M:
                 problem = (
                     f"expected metres of the world frame, got longitude and latitude: coordinates"
-                    f" {_format_span(xy_m)}, as degrees {_format_distance(distance_m)} from the region of interest"
+                    f" {_format_span(xy_m)}, as degrees {format_distance(distance_m)} from the region of interest"
                 )
                 raise InputError(where, problem, hint)
         self._check_near(WORLD_READING, xy_m, where, hint)
@@ -463,7 +465,10 @@ class Georeference:
         frame = self.frame
         crs = parse_crs(declared, where)
         if crs.is_engineering:
-            return WORLD_READING
+            unit = crs.axis_info[0] if crs.axis_info else None
+            if unit is None or unit.unit_conversion_factor in (0.0, 1.0):
+                return WORLD_READING
+            return CoordinateReading(f"{unit.unit_name} of {crs.name}", lambda xy: xy * unit.unit_conversion_factor)
         if frame is not None:
             return CoordinateReading(crs.name, lambda points: frame.from_crs(points, declared), where)
         if crs.is_projected and all(axis.unit_name == "metre" for axis in crs.axis_info[:2]):
@@ -478,7 +483,7 @@ class Georeference:
         if distance_m <= FAR_M:
             return
         problem = (
-            f"coordinates {_format_span(xy)} are {_format_distance(distance_m)} from the region of interest,"
+            f"coordinates {_format_span(xy)} are {format_distance(distance_m)} from the region of interest,"
             f" read as {reading.description}"
         )
         distances_m = {words: self.distance_m(points) for words, points in self._alternatives(xy)}
@@ -566,7 +571,8 @@ def _format_span(xy: FloatArray) -> str:
     return f"({x0:.10g} to {x1:.10g}, {y0:.10g} to {y1:.10g})"
 
 
-def _format_distance(distance_m: float) -> str:
+def format_distance(distance_m: float) -> str:
+    """Return a distance for a message: kilometres from 10 km on, else metres."""
     if not np.isfinite(distance_m):
         return "infinitely far"
     return f"{distance_m / 1000:,.0f} km" if distance_m >= 10_000 else f"{distance_m:.0f} m"

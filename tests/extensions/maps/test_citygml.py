@@ -95,9 +95,12 @@ def test_objects_outside_the_window_are_left_out(tmp_path: Path) -> None:
     result = citygml.read_solids([path], CONTEXT)
     assert [mesh.name for mesh in result.meshes] == ["near"]
     assert result.counts.dropped == {"out_of_range": {"building": 1}}
-    path = write_model(tmp_path / "b.gml", house("far", 1300, 0))
-    result = citygml.read_solids([path], CONTEXT)
-    assert result.notes == ("b.gml: none of its 1 object is within reach; the nearest is 1.0 km away.",)
+    for east_m, distance in ((1300, "1000 m"), (335, "35 m")):
+        path = write_model(tmp_path / "b.gml", house("far", east_m, 0))
+        (note,) = citygml.read_solids([path], CONTEXT).notes
+        assert (
+            note == f"b.gml: none of its 1 object is within reach of the sensors; the nearest is {distance} beyond it."
+        )
 
 
 def test_swapped_axes_are_an_error(tmp_path: Path) -> None:
