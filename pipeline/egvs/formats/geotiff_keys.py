@@ -198,7 +198,8 @@ class GeoKeys:
         """Return the system of longitude and latitude; None if the keys have none."""
         code = self._code(_GEOGRAPHIC)
         datum_code = self._code(_DATUM)
-        if code is None and datum_code in _NUMBERED_DATUMS and self._code(_MERIDIAN) in (None, _GREENWICH):
+        is_numbered = datum_code in _NUMBERED_DATUMS and self._code(_MERIDIAN) in (None, _GREENWICH)
+        if code is None and datum_code is not None and is_numbered:
             code = datum_code - 2000  # EPSG numbers a datum and its system alike; PROJ knows the shifts of the latter
         if code is not None:
             return _from_epsg(code)

@@ -49,9 +49,8 @@ class _Sweep(NamedTuple):
 
 
 def can_open(_path: Path, head: bytes) -> bool:
-    """Return whether a JSON list begins with a label, or with an entry of ``data_info.json``."""
-    is_list = head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")
-    return is_list and (b'"3d_location"' in head or b'"label_lidar_std_path"' in head)
+    """Return whether a file with a member of a label, or of an entry of ``data_info.json``, is a JSON list."""
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")
 
 
 def companions(path: Path) -> Sequence[Path]:
