@@ -22,7 +22,7 @@ import gzip
 import re
 import zlib
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -223,7 +223,10 @@ def _from_root(head: bytes, rest: IO[bytes]) -> bytes:
         has_root = start is not None and start[1] not in (b"?", b"!", b"")
         root_end = text.find(b">") if has_root else -1
         is_complete = 0 <= root_end <= len(text) - HEAD_BYTES
-        chunk = b"" if is_complete or size > _MAX_PROLOG_BYTES else rest.read(_CHUNK_BYTES)
+        chunk = b""
+        if not is_complete and size <= _MAX_PROLOG_BYTES:
+            with suppress(EOFError, gzip.BadGzipFile, zlib.error):  # damaged: its reader says so
+                chunk = rest.read(_CHUNK_BYTES)
         if not chunk:
             return text[: max(root_end, 0) + HEAD_BYTES] if has_root else b""
         text += chunk.replace(b"\0", b"")

@@ -11,7 +11,7 @@ first; the ``<location>`` of their network states the frame. The other readers c
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -388,6 +388,31 @@ class MapContext:
         """
         frame = self._frame_or_alignment(crs, where)
         return frame.from_world(xy_m) if isinstance(frame, Alignment) else frame.to_crs(xy_m, str(crs))
+
+    def usable_crs(self, read: Callable[[], str | None], where: str) -> str | None:
+        """Return the reference system that a file declares; None where only the alignment can place the file.
+
+        Parameters
+        ----------
+        read
+            Returns what the file declares; it may raise an InputError.
+        where
+            The file, for messages.
+
+        Raises
+        ------
+        InputError
+            When the declaration is damaged or PROJ cannot use the system, and there is no alignment.
+        """
+        try:
+            crs = read()
+            if crs is not None:
+                parse_crs(crs, where)
+        except InputError as error:
+            if self.alignment is None:
+                raise InputError(error.where, error.problem, f"{error.hint} Or: {ALIGN_HINT}") from None
+            return None
+        return crs
 
     def height_unit(self, crs: str | None, where: str) -> HeightUnit:
         """Return the unit of the heights of a file; that of the alignment for files without a reference system."""

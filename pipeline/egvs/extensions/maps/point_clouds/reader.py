@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,6 @@ from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
 from egvs.core.wording import number_of
 from egvs.creation.map_parts import (
-    ALIGN_HINT,
     GROUND_KIND,
     OBJECT_KIND,
     OUT_OF_RANGE,
@@ -159,7 +159,6 @@ class _Survey:
     kept: int = 0
     marked: Counter[str] = field(default_factory=Counter)
     units: dict[str, None] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
 
     def drop(self, reason: str, points: int) -> None:
         if points:
@@ -180,7 +179,7 @@ def _read_file(survey: _Survey, path: Path, context: MapContext) -> None:
         nearest_m = np.inf
         for number, chunk in enumerate(point_clouds.stream_points(plain, where)):
             if number == 0:
-                crs = _declared_crs(survey, plain, context, where)
+                crs = context.usable_crs(partial(point_clouds.point_cloud_crs, plain, where), where)
                 survey.units.setdefault(_unit_note(context.height_unit(crs, where)))
             if chunk.scan not in scans:
                 scans[chunk.scan] = _Scan(_station(chunk.station_m, crs, context, where))
@@ -204,17 +203,6 @@ def _read_file(survey: _Survey, path: Path, context: MapContext) -> None:
         )
         raise InputError(where, problem, "Check its coordinate reference system, or its --align.")
     survey.scans += scans.values()
-
-
-def _declared_crs(survey: _Survey, plain: Path, context: MapContext, where: str) -> str | None:
-    """Return the reference system of a file; None if it declares none, or none that can be used with an alignment."""
-    try:
-        return point_clouds.point_cloud_crs(plain, where)
-    except InputError as error:
-        if context.alignment is None:
-            raise InputError(error.where, error.problem, f"{error.hint} Or: {ALIGN_HINT}") from None
-        survey.notes.append(f"{Path(where).name}: {error.problem}; --align says where it is.")
-        return None
 
 
 def _unit_note(unit: HeightUnit) -> str:
@@ -324,7 +312,7 @@ def _notes(survey: _Survey, surface: CloudSurface, points: int) -> tuple[str, ..
         f"The as-built surface has {len(surface.ground.faces):,} triangles of ground and"
         f" {len(surface.objects.faces):,} of everything else, all open: no site can be inside of an object."
     )
-    return (read, made, _station_note(survey), *survey.units, *survey.notes)
+    return (read, made, _station_note(survey), *survey.units)
 
 
 def _station_note(survey: _Survey) -> str:
