@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 
 from egvs.core import files, limits
 from egvs.core.errors import InputError
-from egvs.core.reading import COMPLETE_FILE
+from egvs.core.reading import COMPLETE_FILE, name_in_errors
 from egvs.formats.reader_process import Block, read_blocks, serve
 
 SUFFIX = ".zip"
@@ -82,13 +82,8 @@ def unpack_archives(paths: Sequence[Path], suffixes: Sequence[str] = (SUFFIX,)) 
             folder.mkdir()
             _unpack(path, folder)
             unpacked.add(path, folder)
-        try:
+        with name_in_errors(unpacked.user_text):
             yield unpacked
-        except InputError as error:
-            texts = [unpacked.user_text(text) for text in (error.where, error.problem, error.hint)]
-            if texts == [error.where, error.problem, error.hint]:
-                raise
-            raise InputError(*texts) from None
 
 
 def _unpack(path: Path, folder: Path) -> None:
