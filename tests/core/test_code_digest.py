@@ -165,13 +165,13 @@ def test_library_versions_are_those_installed() -> None:
 
 
 MOST_LINES = {
-    "check": 17_500,  # with comparisons of heights, sizes and speeds, of vehicles with roads and of limits
-    "statics": 10_000,
-    "scan": 13_000,  # 300 of them read the files of beams that makers give
+    "check": 17_700,  # with comparisons of heights, sizes and speeds, of vehicles with roads and of limits
+    "statics": 10_200,  # archives, and one message for each system that PROJ cannot convert
+    "scan": 13_200,  # 300 of them read the files of beams that makers give
     "traffic": 10_800,  # with limits of sizes
     "tpog": 4_200,
-    "score": 18_000,  # losses of returns are part of every score; what people notice, and levels of groups
-    "report": 21_000,
+    "score": 18_300,  # losses of returns are part of every score; what people notice, and levels of groups
+    "report": 21_300,
 }
 """Code lines behind the key of each stage, at most: a stage runs again whenever one of them changes."""
 

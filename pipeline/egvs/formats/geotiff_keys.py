@@ -95,7 +95,7 @@ class GeoKeys:
                 if not all(map(math.isfinite, numbers)):
                     raise ValueError(f"the GeoTIFF key {key} is not a finite number")
                 values[key] = numbers[0]
-            elif location == _TEXTS and offset + size <= len(texts):
+            elif location == _TEXTS:
                 values[key] = texts[offset : offset + size].decode("latin-1").rstrip("\0| ")
             else:
                 raise ValueError(f"the GeoTIFF key {key} points beyond its record")
@@ -145,11 +145,11 @@ class GeoKeys:
 
     def _horizontal(self) -> dict[str, Any] | None:
         if self.values.get(_MODEL_TYPE) == _GEOCENTRIC_MODEL:
-            return _from_epsg(self._code(_GEOGRAPHIC) or 4978)
+            return _from_epsg(self._code(_GEOGRAPHIC) or 4978, "GeodeticCRS", "GeographicCRS")
         unit = self._unit(_UNIT, _UNIT_SIZE)
         code = self._code(_PROJECTED)
         if code is not None:
-            return _with_unit(_from_epsg(code), unit)
+            return _with_unit(_from_epsg(code, "ProjectedCRS"), unit)
         conversion = self._conversion(unit)
         if conversion is None:
             if self.values.get(_MODEL_TYPE) == 2 or _PROJECTED not in self.values:
@@ -202,7 +202,7 @@ class GeoKeys:
         if code is None and datum_code is not None and is_numbered:
             code = datum_code - 2000  # EPSG numbers a datum and its system alike; PROJ knows the shifts of the latter
         if code is not None:
-            return _from_epsg(code)
+            return _from_epsg(code, "GeographicCRS")
         datum = self._datum()
         if datum is None:
             return None
@@ -273,9 +273,7 @@ class GeoKeys:
         if horizontal["type"] not in ("ProjectedCRS", "GeographicCRS"):
             return None
         if code is not None and code not in _NO_VERTICAL_CODE:
-            vertical = _from_epsg(_OLD_VERTICAL.get(code, code))
-            if vertical["type"] == "VerticalCRS":
-                return _with_unit(vertical, unit)
+            return _with_unit(_from_epsg(_OLD_VERTICAL.get(code, code), "VerticalCRS"), unit)
         if unit is None:
             return None
         name = self._text(_VERTICAL_CITATION, default="heights of the GeoTIFF keys")
@@ -291,8 +289,8 @@ class GeoKeys:
 _METRE: dict[str, Any] = {"type": "LinearUnit", "name": "metre", "conversion_factor": 1.0}
 
 
-def _from_epsg(code: int) -> dict[str, Any]:
-    """Return a system as PROJJSON; ValueError where EPSG has no such code."""
+def _from_epsg(code: int, *types: str) -> dict[str, Any]:
+    """Return a system as PROJJSON; ValueError where EPSG has none of these types with such a code."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -300,6 +298,8 @@ def _from_epsg(code: int) -> dict[str, Any]:
         found: dict[str, Any] = json.loads(CRS.from_epsg(code).to_json())
     except CRSError:
         raise ValueError(f"its GeoTIFF keys name EPSG:{code}, which PROJ does not know") from None
+    if found["type"] not in types:
+        raise ValueError(f"its GeoTIFF keys name EPSG:{code} as a {types[0]}, but it is a {found['type']}")
     return found
 
 
