@@ -272,21 +272,32 @@ def _matches(pattern: bytes | None, head: bytes) -> bool:
 
 def _contains(path: Path, pattern: bytes) -> bool:
     """Return whether a pattern is in a file; True, too, if its gzip is damaged or too large: its reader says so."""
-    search = re.compile(pattern).search
-    size = 0
     try:
-        with open_input(path) as file, _unpacked(file) as content:
-            rest = b""
-            while chunk := content.read(_CHUNK_BYTES):
-                if search(rest + chunk):
-                    return True
-                rest = chunk[-_OVERLAP_BYTES:]
-                size += len(chunk)
-                if size > limits.UNPACKED.maximum * limits.MB:
-                    return True
+        return first_match(path, pattern) is not None
     except (EOFError, OSError, zlib.error):
         return True
-    return False
+
+
+def first_match(path: Path, pattern: bytes) -> bytes | None:
+    """Return the first text (at most 256 bytes) of a file, after gunzip, that a regular expression matches.
+
+    Raises
+    ------
+    OSError, EOFError, zlib.error
+        When the file cannot be read, its gzip is damaged, or has more than :data:`egvs.core.limits.UNPACKED`.
+    """
+    search = re.compile(pattern).search
+    size = 0
+    with open_input(path) as file, _unpacked(file) as content:
+        rest = b""
+        while chunk := content.read(_CHUNK_BYTES):
+            if match := search(rest + chunk):
+                return match[0]
+            rest = chunk[-_OVERLAP_BYTES:]
+            size += len(chunk)
+            if size > limits.UNPACKED.maximum * limits.MB:
+                raise EOFError
+    return None
 
 
 def _unpacked(file: IO[Any]) -> AbstractContextManager[IO[bytes]]:

@@ -103,6 +103,10 @@ PEOPLE_HINT = (
     "Pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
 
+_FEET_NOTE = (
+    "The distance between the points of --align agrees in feet: point clouds, meshes and city models without a"
+    " reference system are taken to be in feet, heights too."
+)
 _NO_SIGNALS_NOTE = "No junction in the map has signals; the one with the most incoming lanes was chosen."
 
 
@@ -469,6 +473,8 @@ def _read_maps(draft: _Draft) -> None:
     )
     draft.surface = ground_reference.read_terrain(draft.surface_files, context)
     check_used(context)
+    if context.alignment is not None and context.alignment.unit_m != 1.0:
+        draft.notes.append(_FEET_NOTE)
 
 
 def _lay_on_ground(draft: _Draft) -> None:

@@ -27,6 +27,7 @@ FILES = {
     "CityGML": [("a.gml", CITY_MODEL), ("a.xml", CITY_MODEL.decode().encode("utf-16")),
                 ("53392640_bldg_6697_op.gml", CITY_MODEL), ("a.gml", LICENCE + b"<CityModel" + NAMESPACES + b">")],
     "CityGML relief": [("a.gml", CITY_MODEL + RELIEF), ("a.gml", b"<CityModel" + NAMESPACES + b">" + RELIEF),
+                       ("a.gml", CITY_MODEL + b"<!--" + b"x" * 9000 + b"--><cityObjectMember>\n <dem:ReliefFeature>"),
                        ("53392640_dem_6697_op.gml", CITY_MODEL)],
     "CityJSON": [("a.city.json", b""), ("a.json", b'{"type" : "CityJSON"}'), ("a.json", LATE_CITYJSON)],
     "building footprints": [("a.geojson", b""), ("a.GPKG", b""), ("a.shp", b""), ("a.parquet", b""),

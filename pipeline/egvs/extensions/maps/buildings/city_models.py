@@ -159,7 +159,7 @@ class _Collector:
         where = f"{file.path}: {city_object.name}"
         system = systems.get(city_object.srs_name)
         if system is None:
-            system = systems[city_object.srs_name] = parse_srs_name(city_object.srs_name, where)
+            system = systems[city_object.srs_name] = self._reference_system(city_object.srs_name, where)
 
         selection = select_surfaces(city_object)
         self.repairs["unresolved"] += selection.unresolved
@@ -184,6 +184,10 @@ class _Collector:
             self._add_footprint(city_object, kind, rings_m)
         else:
             self._add_mesh(city_object, kind, rings_m)
+
+    def _reference_system(self, srs_name: str, where: str) -> ReferenceSystem:
+        crs = self.context.usable_crs(lambda: parse_srs_name(srs_name, where).crs, where)
+        return ReferenceSystem(None) if crs is None else parse_srs_name(srs_name, where)
 
     def _place(self, placement: Placement, file: CityModelFile, system: ReferenceSystem, where: str) -> Rings:
         """Return the surfaces of a template where it is placed."""
