@@ -146,18 +146,6 @@ def parse_crs(crs: Any, where: str) -> CRS:
         raise InputError(where, error.problem, error.hint) from None
 
 
-def is_known_crs(crs: str) -> bool:
-    """Return whether PROJ knows a coordinate reference system, even if it cannot convert its coordinates."""
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
-
-    try:
-        CRS.from_user_input(crs)
-    except (CRSError, ValueError):
-        return False
-    return True
-
-
 @cache
 def _horizontal_crs(crs: str) -> CRS:
     return _horizontal_part(_HEIGHT_WORDS.sub("", crs))

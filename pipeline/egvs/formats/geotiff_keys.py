@@ -295,12 +295,12 @@ def _from_epsg(code: int, *types: str) -> dict[str, Any]:
     from pyproj.exceptions import CRSError
 
     try:
-        found: dict[str, Any] = json.loads(CRS.from_epsg(code).to_json())
+        system: dict[str, Any] = json.loads(CRS.from_epsg(code).to_json())
     except CRSError:
         raise ValueError(f"its GeoTIFF keys name EPSG:{code}, which PROJ does not know") from None
-    if found["type"] not in types:
-        raise ValueError(f"its GeoTIFF keys name EPSG:{code} as a {types[0]}, but it is a {found['type']}")
-    return found
+    if system["type"] not in types:
+        raise ValueError(f"its GeoTIFF keys name EPSG:{code} as a {types[0]}, but it is a {system['type']}")
+    return system
 
 
 def _with_unit(system: dict[str, Any], unit: dict[str, Any] | None) -> dict[str, Any]:
