@@ -1,6 +1,7 @@
 """Which reader opens a map file, and what a set of files is rejected for."""
 
 import gzip
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,20 @@ def test_folder_stands_for_its_maps(tmp_path: Path) -> None:
     (tmp_path / "roads.net.xml").write_bytes(NETWORK.read_bytes())
     (tmp_path / "notes.txt").write_text("not a map")
     assert map_readers.list_files([tmp_path]) == [tmp_path / "roads.net.xml"]
+
+
+def test_archive_stands_for_its_maps(tmp_path: Path, run_egvs) -> None:
+    path = tmp_path / "maps.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("town/small.osm", SMALL.read_bytes())
+        archive.writestr("notes.txt", "not a map")
+    code, text, error = run_egvs("new", tmp_path / "made", "--from", path)
+    assert code == 0 and "East Street and North Street" in text, error
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("town/small.osm.gz", gzip.compress(SMALL.read_bytes())[:-200])
+    code, _, error = run_egvs("new", tmp_path / "other", "--from", path)
+    assert code == 2 and f"{path}/town/small.osm.gz: damaged gzip file" in error
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize(

@@ -234,3 +234,12 @@ def test_command_line_rejects_options(tmp_path: Path, run_egvs, options: tuple[o
 def test_plans_of_a_new_scenario_have_one_sensor_per_pole(tmp_path: Path) -> None:
     create_scenario(tmp_path / "out", SMALL)
     assert loading.load(tmp_path / "out").placement.most_per_pole == 1
+
+
+def test_errors_of_a_new_folder_name_its_final_path(tmp_path: Path) -> None:
+    def reject(folder: Path) -> None:
+        raise InputError(folder / "scenario.toml", f"is wrong in {folder}")
+
+    with pytest.raises(InputError, match=rf"^{tmp_path}/made/scenario\.toml: is wrong in {tmp_path}/made"):
+        scenario_files.publish_folder(tmp_path / "made", [("scenario.toml", "")], reject)
+    assert not list(tmp_path.iterdir())

@@ -388,3 +388,20 @@ def test_slope_surface_model_and_mesh_in_one_scenario(tmp_path: Path, run_egvs) 
     solids = re.search(r"\((\d+) solids with", printed)
     assert code == 0 and solids is not None, error
     assert f"{solids[1]} solids" in checked
+
+
+@needs("maps")
+def test_mesh_in_feet_is_converted_to_metres(tmp_path: Path, run_egvs) -> None:
+    """A shed of 20 feet beside the junction; the points of --align are 328.08 feet apart."""
+    import trimesh
+
+    shed = trimesh.creation.box((20, 20, 20), trimesh.transformations.translation_matrix((200, 200, 10)))
+    shed.export(tmp_path / "shed.obj")
+    align = ("--align", "0,0=52.0,10.0", "--align", "0,328.08=52.000899,10.0")
+    code, printed, error = run_egvs("new", tmp_path / "made", "--from", SMALL, tmp_path / "shed.obj", *align)
+    assert code == 0, error
+    assert "note: The distance between the points of --align agrees in feet" in printed
+    vertices_m = meshes.load_clean_mesh(tmp_path / "made" / "mesh.ply", 1e6)[0].vertices
+    np.testing.assert_allclose(
+        np.ptp(vertices_m, axis=0), 20 * 0.3048, atol=0.1
+    )  # turned from true north to the grid's

@@ -10,12 +10,23 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pyproj import CRS
 from scipy.integrate import quad
 
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.formats import georeference
-from egvs.formats.georeference import WGS84, WORLD, Georeference, WorldFrame, declared_crs, geojson_coordinates
+from egvs.formats.georeference import (
+    WGS84,
+    WORLD,
+    Georeference,
+    WorldFrame,
+    declared_crs,
+    geojson_coordinates,
+    height_unit,
+    parse_crs,
+    proj_string,
+)
 
 A_M, F = 6378137.0, 1 / 298.257223563
 UTM32 = WorldFrame("+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs")
@@ -307,3 +318,53 @@ def test_projection_as_a_proj_string(crs: str, text: str) -> None:
 def test_unknown_projection_has_no_proj_string() -> None:
     with pytest.raises(InputError, match="unknown coordinate reference system"):
         georeference.proj_string("nowhere", "map.xodr")
+
+
+GEOID_TAIL = "+geoidgrids=no_such_grid.gtx +vunits=us-ft"
+UTM_15 = "+proj=utm +zone=15 +datum=WGS84 +units=m"
+
+
+@pytest.mark.parametrize(
+    "crs",
+    [
+        f"{UTM_15} {GEOID_TAIL} +no_defs",
+        f"+proj=utm +k_0=1 +zone=15 +datum=WGS84 {GEOID_TAIL}",
+        CRS(f"{UTM_15} {GEOID_TAIL}").to_wkt(),
+        "EPSG:32615+5773",
+        "EPSG:32615",
+    ],
+)
+def test_x_and_y_need_no_model_of_the_geoid(crs: str) -> None:
+    lon_lat_deg = np.array([[-93.35, 41.57]])
+    expected = WorldFrame("EPSG:32615").from_lon_lat(lon_lat_deg)
+    frame = WorldFrame.from_projection(crs, (0.0, 0.0), "a.xodr") if crs.startswith("+") else WorldFrame(crs)
+    np.testing.assert_allclose(frame.from_lon_lat(lon_lat_deg), expected, atol=1e-6)
+    np.testing.assert_allclose(WorldFrame("EPSG:32615").from_crs(expected, crs), expected, atol=1e-6)
+    assert "geoid" not in proj_string(crs, "a.xodr")
+
+
+def test_heights_keep_the_unit_that_the_geoid_string_states() -> None:
+    unit = height_unit(f"{UTM_15} {GEOID_TAIL}", "a.osi")
+    assert (unit.metres, unit.source) == (pytest.approx(1200 / 3937), "its vertical system")
+
+
+@pytest.mark.parametrize(
+    ("crs", "message"),
+    [
+        ("+proj=utm +zone=32 +ellps=bessel +nadgrids=no_such_grid.gsb", "the grid no_such_grid.gsb is not installed"),
+        ("EPSG:4978", "'WGS 84' is geocentric. Convert the coordinates to a map projection"),
+        ("EPSG:5773", "'EGM96 height' is a system of heights"),
+        ("IAU_2015:49900", "do not belong to the same celestial body"),
+        ("Local", "unknown coordinate reference system 'Local'"),
+    ],
+)
+def test_one_message_where_proj_cannot_convert(crs: str, message: str) -> None:
+    with pytest.raises(InputError, match=f"^a.csv: crs: .*{message}"):
+        parse_crs(crs, "a.csv: crs")
+
+
+def test_a_local_system_in_feet_is_converted_to_metres() -> None:
+    local = CRS('LOCAL_CS["site",UNIT["foot",0.3048],AXIS["E",EAST],AXIS["N",NORTH]]').to_wkt()
+    roi = Roi((0.0, 0.0, 0.0), (10.0, 10.0, 5.0))
+    reading = Georeference(None, roi, "scenario.toml").read_coordinates(np.array([[10.0, 20.0]]), "a.las", local)
+    np.testing.assert_allclose(reading.to_world(np.array([[10.0, 20.0]])), [[3.048, 6.096]])

@@ -152,6 +152,26 @@ def test_write_rejects_unknown_suffix_and_wrong_shape(tmp_path: Path) -> None:
 # --- PCD ---
 
 
+def test_pcd_that_is_stored_without_compression(tmp_path: Path) -> None:
+    """Where LZF gains nothing, writers store the bytes as they are; bytes that are LZF are unpacked all the same."""
+    plain = np.random.default_rng(1).uniform(-20, 20, (3, 60)).astype("<f4")
+    head = pcd("x y z", "4 4 4", "F F F", 60, "binary_compressed")
+    sizes = struct.pack("<II", plain.nbytes, plain.nbytes)
+    assert read(tmp_path, "a.pcd", head + sizes + plain.tobytes()) == plain.T.astype(np.float64).tolist()
+    assert read(tmp_path, "b.pcd", head + packed(plain.tobytes())) == plain.T.astype(np.float64).tolist()
+    damaged = head + struct.pack("<II", 100, 720) + plain.tobytes()[:100]
+    with pytest.raises(InputError, match="not valid LZF data"):
+        read(tmp_path, "c.pcd", damaged)
+
+
+@pytest.mark.parametrize("padding", [bytes(4096), b"\n", b"\0\r\n \0"])
+def test_padding_behind_binary_points(tmp_path: Path, padding: bytes) -> None:
+    for name in ("a.pcd", "a.ply"):
+        write_points(tmp_path / name, POINTS)
+        content = (tmp_path / name).read_bytes()
+        assert read(tmp_path, name, content + padding) == POINTS.tolist()
+
+
 def test_pcd_ascii_reads_fields_in_any_order(tmp_path: Path) -> None:
     head = pcd("rgb z y n x", "4 4 4 4 8", "U F F F F", 2, "ascii", "COUNT 1 1 1 2 1\n").decode()
     assert read(tmp_path, "a.pcd", head + "9 3 2 0 0 1\r\n\n9\t6 5  nan inf 4.1") == [[1, 2, 3], [4.1, 5, 6]]
@@ -524,7 +544,8 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
          "the header declares 0 points. Use a file with at least one return"),
         ("a.pcd", ASCII_PCD.replace("ascii", "zip"), "DATA: expected ascii, binary or binary_compressed, got 'zip'"),
         ("a.pcd", pcd_with_viewpoint("0 0 0 2 0 0 0"),
-         "VIEWPOINT: .* got '0 0 0 2 0 0 0'. Write a translation and a unit quaternion"),
+         "VIEWPOINT: expected a quaternion of length 1, got '2 0 0 0' of length 2. Write a translation and a unit"),
+        ("a.pcd", pcd_with_viewpoint("0 0 0 0 0 0 0"), "expected a quaternion of length 1, got '0 0 0 0' of length 0"),
         ("a.pcd", pcd_with_viewpoint("0 0 nan 1 0 0 0"), "VIEWPOINT: .* got '0 0 nan 1 0 0 0'"),
         ("a.pcd", pcd_with_viewpoint("0 0 0"), "VIEWPOINT: .* got '0 0 0'"),
         # PCD, points
@@ -538,7 +559,7 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
         ("a.pcd", ASCII_PCD.replace("1 2 3\n4 5 6", "nan 2 3\n4 5 inf"),
          "expected at least one return with finite x, y and z, got none of 2"),
         ("a.pcd", BINARY + bytes(23), r"declares 2 points of 12 bytes \(24 bytes\), but the file contains 23 bytes"),
-        ("a.pcd", BINARY + bytes(25), r"\(24 bytes\), but the file contains 25 bytes"),
+        ("a.pcd", BINARY + bytes(24) + b"\1", r"\(24 bytes\), but the file contains 25 bytes"),
         ("a.pcd", ASCII_PCD.replace("DATA ascii", "DATA " + "x" * 900), "DATA: .* got 'x{60}'"),
         ("a.pcd", PACKED + bytes(7), r"the file ends before its points \(only 7 bytes of data\)"),
         ("a.pcd", PACKED + struct.pack("<II", 1, 12) + b"\0",
@@ -570,7 +591,7 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
         ("a.ply", ASCII_PLY.replace("4 5 6\n", "4 5\n"), "line 9: expected 3 values, got 2"),
         ("a.ply", ASCII_PLY.replace("4 5 6\n", "4 5 z\n"), "line 9: expected a number, got 'z'"),
         ("a.ply", BINARY_PLY + "\0" * 47, r"2 points of 24 bytes \(48 bytes\), but the file contains 47 bytes"),
-        ("a.ply", BINARY_PLY + "\0" * 49, r"\(48 bytes\), but the file contains 49 bytes"),
+        ("a.ply", BINARY_PLY + "\0" * 48 + "\1", r"\(48 bytes\), but the file contains 49 bytes"),
         # CSV
         ("a.csv", "", r"a\.csv: expected exactly one column 'x_m', got none"),
         ("a.csv", CSV.replace("x_m", "x"), "expected exactly one column 'x_m', got x, y_m, z_m. Write a header row"),

@@ -22,7 +22,7 @@ import gzip
 import re
 import zlib
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -44,8 +44,17 @@ KINDS = ("map", "tracks", "points", "sweeps", "labels")
 """What a file can hold."""
 
 HEAD_BYTES = 4096
-"""How much of a file is its beginning, after gunzip."""
+"""How much of a file is its beginning, after gunzip; of XML, counted from the root element."""
 
+_MAX_PROLOG_BYTES = 16_000_000
+"""How much may come before the root element: comments, licences, processing instructions, a document type."""
+
+_XML_START = re.compile(rb"(?:\xef\xbb\xbf|\xff\xfe|\xfe\xff)?\s*<(.?)", re.DOTALL)
+_PROLOG_PART = re.compile(
+    rb"(?:\xef\xbb\xbf|\xff\xfe|\xfe\xff)?\s*"
+    rb"(?:<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^\[>]*+(?:\[(?:[^\]\"']++|\"[^\"]*+\"|'[^']*+')*+\][^>]*+)?>)\s*",
+    re.DOTALL,
+)
 _GZIP = b"\x1f\x8b"
 _CHUNK_BYTES, _OVERLAP_BYTES = 1 << 20, 256
 
@@ -65,7 +74,7 @@ class Reader:
     suffixes
         Endings of file names, lower case, with the dot; see :func:`with_gzip`.
     head
-        Regular expression for the first :data:`HEAD_BYTES` of a file, after gunzip.
+        Regular expression for the beginning of a file (:func:`read_head`).
     content
         Regular expression for some text (at most 256 bytes) that is somewhere in each file of the format.
     gives
@@ -176,22 +185,52 @@ def reader_error(reader: Reader, problem: str) -> MissingBackendError:
 
 
 def read_head(path: Path) -> bytes:
-    """Return the first bytes of a file, after gunzip where possible; InputError when it cannot be read."""
+    """Return the first :data:`HEAD_BYTES` of a file, after gunzip where possible; InputError when it cannot be read.
+
+    Of XML, the beginning is the root element, with as much behind its first tag: comments, licences and lists of
+    namespaces may be long.
+    """
     if not path.is_file():
         raise InputError(path, "no such file", "Check the path.")
     try:
         with open_input(path) as content:
             head: bytes = content.read(HEAD_BYTES)
+            if not head.startswith(_GZIP):
+                return _from_root(head, content)
     except OSError as error:
         problem = f"the file cannot be read ({error.strerror or error})"
         raise InputError(path, problem, "Check its permissions, or leave it out.") from None
-    if not head.startswith(_GZIP):
-        return head
     try:
         with open_input(path) as content, gzip.open(content) as unpacked:
-            return unpacked.read(HEAD_BYTES)
+            return _from_root(unpacked.read(HEAD_BYTES), cast(IO[bytes], unpacked))
     except (EOFError, OSError, zlib.error):  # damaged: its reader says so
         return head
+
+
+def _from_root(head: bytes, rest: IO[bytes]) -> bytes:
+    """Return the beginning of a file; of XML, from its root element to :data:`HEAD_BYTES` behind the root's first tag.
+
+    Text in UTF-16 loses its zero bytes.
+    """
+    text = head.replace(b"\0", b"")
+    if _XML_START.match(text) is None:
+        return head
+    size = len(text)
+    while True:
+        while part := _PROLOG_PART.match(text):
+            text = text[part.end() :]
+        start = _XML_START.match(text)
+        has_root = start is not None and start[1] not in (b"?", b"!", b"")
+        root_end = text.find(b">") if has_root else -1
+        is_complete = 0 <= root_end <= len(text) - HEAD_BYTES
+        chunk = b""
+        if not is_complete and size <= _MAX_PROLOG_BYTES:
+            with suppress(EOFError, gzip.BadGzipFile, zlib.error):  # damaged: its reader says so
+                chunk = rest.read(_CHUNK_BYTES)
+        if not chunk:
+            return text[: max(root_end, 0) + HEAD_BYTES] if has_root else b""
+        text += chunk.replace(b"\0", b"")
+        size += len(chunk)
 
 
 @cache
@@ -233,21 +272,32 @@ def _matches(pattern: bytes | None, head: bytes) -> bool:
 
 def _contains(path: Path, pattern: bytes) -> bool:
     """Return whether a pattern is in a file; True, too, if its gzip is damaged or too large: its reader says so."""
-    search = re.compile(pattern).search
-    size = 0
     try:
-        with open_input(path) as file, _unpacked(file) as content:
-            rest = b""
-            while chunk := content.read(_CHUNK_BYTES):
-                if search(rest + chunk):
-                    return True
-                rest = chunk[-_OVERLAP_BYTES:]
-                size += len(chunk)
-                if size > limits.UNPACKED.maximum * limits.MB:
-                    return True
+        return first_match(path, pattern) is not None
     except (EOFError, OSError, zlib.error):
         return True
-    return False
+
+
+def first_match(path: Path, pattern: bytes) -> bytes | None:
+    """Return the first text (at most 256 bytes) of a file, after gunzip, that a regular expression matches.
+
+    Raises
+    ------
+    OSError, EOFError, zlib.error
+        When the file cannot be read, its gzip is damaged, or has more than :data:`egvs.core.limits.UNPACKED`.
+    """
+    search = re.compile(pattern).search
+    size = 0
+    with open_input(path) as file, _unpacked(file) as content:
+        rest = b""
+        while chunk := content.read(_CHUNK_BYTES):
+            if match := search(rest + chunk):
+                return match[0]
+            rest = chunk[-_OVERLAP_BYTES:]
+            size += len(chunk)
+            if size > limits.UNPACKED.maximum * limits.MB:
+                raise EOFError
+    return None
 
 
 def _unpacked(file: IO[Any]) -> AbstractContextManager[IO[bytes]]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,25 @@ def translate_errors(where: object, expected: str = COMPLETE_FILE, doing: str = 
         raise InputError(where, f"{doing} ({describe_exception(error)})", expected) from error
     except Exception as error:
         raise InputError(where, f"{doing} ({describe_exception(error)})", expected) from error
+
+
+@contextmanager
+def name_in_errors(rename: Callable[[str], str]) -> Iterator[None]:
+    """Let InputErrors of the block name the user's files instead of temporary copies.
+
+    Parameters
+    ----------
+    rename
+        Returns a text with the user's names.
+    """
+    try:
+        yield
+    except InputError as error:
+        texts = [error.where, error.problem, error.hint]
+        renamed = [rename(text) for text in texts]
+        if renamed == texts:
+            raise
+        raise InputError(*renamed) from None
 
 
 def describe_exception(error: BaseException) -> str:

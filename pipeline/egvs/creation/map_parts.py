@@ -11,7 +11,7 @@ first; the ``<location>`` of their network states the frame. The other readers c
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -23,7 +23,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray, Roi
 from egvs.creation.junctions import Streets
-from egvs.formats.georeference import WorldFrame, parse_crs
+from egvs.formats.georeference import HeightUnit, WorldFrame, height_unit, parse_crs
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import StaticsConfig
 
@@ -35,6 +35,9 @@ DECK_BASE_M = 5.0
 
 OUT_OF_RANGE = "out_of_range"
 """The reason to leave out objects outside the window of a map."""
+
+ALIGN_HINT = "Give two of its points and where they are: --align X,Y=LAT,LON --align X,Y=LAT,LON."
+"""How to place a file without a reference system."""
 
 GROUND_KIND, OBJECT_KIND = "ground", "as_built"
 """Kinds of the meshes of a point cloud: its ground, and all else."""
@@ -282,37 +285,42 @@ class Terrain(Protocol):
 class Alignment:
     """Two points of files without a reference system, and where they are in the world frame.
 
-    A rotation and a translation take the middle of the first pair to that of the second; lengths are kept.
+    A rotation and a translation take the middle of the first pair to that of the second; lengths are kept, but for the
+    unit.
 
     Attributes
     ----------
-    local_m, world_m
-        (2, 2) float64: x, y in the file and in the world frame, in metres.
+    local, world_m
+        (2, 2) float64: x, y in the file, in its unit, and in the world frame, in metres.
+    unit_m
+        The unit of the file in metres, also of its heights.
     """
 
-    local_m: FloatArray
+    local: FloatArray
     world_m: FloatArray
+    unit_m: float = 1.0
 
     def to_world(self, xy: FloatArray) -> FloatArray:
         """Return world-frame x, y (n, 2) of x, y (n, 2) in the file."""
-        rotation = self._rotation
-        moved: FloatArray = (xy - self.local_m.mean(axis=0)) @ rotation.T + self.world_m.mean(axis=0)
+        rotation = self.unit_m * self._rotation
+        moved: FloatArray = (xy - self.local.mean(axis=0)) @ rotation.T + self.world_m.mean(axis=0)
         return moved
 
     def from_world(self, xy_m: FloatArray) -> FloatArray:
         """Return x, y (n, 2) in the file of world-frame x, y (n, 2); the inverse of :meth:`to_world`."""
-        moved: FloatArray = (xy_m - self.world_m.mean(axis=0)) @ self._rotation + self.local_m.mean(axis=0)
+        turned = (xy_m - self.world_m.mean(axis=0)) @ self._rotation / self.unit_m
+        moved: FloatArray = turned + self.local.mean(axis=0)
         return moved
 
     @property
     def scale(self) -> float:
         """Distance of the points in the world, divided by that in the file; 1 if both are metres."""
-        local_m, world_m = np.diff(self.local_m, axis=0)[0], np.diff(self.world_m, axis=0)[0]
-        return float(np.hypot(*world_m) / np.hypot(*local_m))
+        local, world_m = np.diff(self.local, axis=0)[0], np.diff(self.world_m, axis=0)[0]
+        return float(np.hypot(*world_m) / np.hypot(*local))
 
     @property
     def _rotation(self) -> FloatArray:
-        (x0, y0), (x1, y1) = np.diff(self.local_m, axis=0)[0], np.diff(self.world_m, axis=0)[0]
+        (x0, y0), (x1, y1) = np.diff(self.local, axis=0)[0], np.diff(self.world_m, axis=0)[0]
         angle = np.arctan2(y1, x1) - np.arctan2(y0, x0)
         return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
@@ -381,12 +389,44 @@ class MapContext:
         frame = self._frame_or_alignment(crs, where)
         return frame.from_world(xy_m) if isinstance(frame, Alignment) else frame.to_crs(xy_m, str(crs))
 
+    def usable_crs(self, read: Callable[[], str | None], where: str) -> str | None:
+        """Return the reference system that a file declares; None where only the alignment can place the file.
+
+        Parameters
+        ----------
+        read
+            Returns what the file declares; it may raise an InputError.
+        where
+            The file, for messages.
+
+        Raises
+        ------
+        InputError
+            When the declaration is damaged or PROJ cannot use the system, and there is no alignment.
+        """
+        try:
+            crs = read()
+            if crs is not None:
+                parse_crs(crs, where)
+        except InputError as error:
+            if self.alignment is None:
+                raise InputError(error.where, error.problem, f"{error.hint} Or: {ALIGN_HINT}") from None
+            return None
+        return crs
+
+    def height_unit(self, crs: str | None, where: str) -> HeightUnit:
+        """Return the unit of the heights of a file; that of the alignment for files without a reference system."""
+        frame = self._frame_or_alignment(crs, where)
+        if isinstance(frame, Alignment):
+            name = "metre" if frame.unit_m == 1.0 else "foot"
+            return HeightUnit(frame.unit_m, name, "from the distance of the points of --align")
+        return height_unit(crs, where)
+
     def _frame_or_alignment(self, crs: str | None, where: str) -> WorldFrame | Alignment:
         """Return what converts coordinates of a system; the alignment for files without one."""
         if crs is None or parse_crs(crs, where).is_engineering:
             if self.alignment is None:
-                hint = "Give two of its points and where they are: --align X,Y=LAT,LON --align X,Y=LAT,LON."
-                raise InputError(where, "the file declares no coordinate reference system", hint)
+                raise InputError(where, "the file declares no coordinate reference system", ALIGN_HINT)
             self.aligned.add(where)
             return self.alignment
         if self.frame is None:

@@ -76,6 +76,7 @@ from egvs.creation.static_objects import MapSummary, ReadMap, StaticObjects, Sur
 from egvs.creation.terrain import ground_heights, ground_reference
 from egvs.creation.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.creation.terrain.relief import Relief, ground_surface
+from egvs.formats.archives import unpack_archives
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.signal_config import ASSUMED_PLANS
@@ -102,6 +103,10 @@ PEOPLE_HINT = (
     "Pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
 
+_FEET_NOTE = (
+    "The distance between the points of --align agrees in feet: point clouds, meshes and city models without a"
+    " reference system are taken to be in feet, heights too."
+)
 _NO_SIGNALS_NOTE = (
     "No junction of three or more roads in the map has signals; the one with the most incoming lanes was chosen."
 )
@@ -392,7 +397,7 @@ def create_scenario(
     folder
         Created by this function; may exist if it is empty.
     maps
-        Files, or folders of files: one road map, and any number of maps of static objects.
+        Files, or folders and ZIP archives of files: one road map, and any number of maps of static objects.
     at
         Latitude, longitude in degrees, or x, y in metres if the road map has no reference system: choose the junction
         there, see :func:`junctions.choose_nearby`. By default, the largest one with signals.
@@ -411,28 +416,35 @@ def create_scenario(
         ``at`` is outside or far from any junction, no site is possible, or an option has no effect. Nothing is written
         then.
     """
-    draft = _open_files(Path(folder), maps, at, options or NewScenarioOptions())
-    _read_roads_and_recordings(draft)
-    _choose_surroundings(draft)
-    _read_maps(draft)
-    _lay_on_ground(draft)
-    _collect_objects(draft)
-    _choose_region(draft)
-    _choose_poles(draft)
-    _add_notes(draft)
-    _plan_traffic(draft)
-    return _write_scenario(draft)
+    options = options or NewScenarioOptions()
+    options.check()
+    paths = [Path(path) for path in ([maps] if isinstance(maps, str | Path) else maps)]
+    with unpack_archives([*paths, *options.surface]) as unpacked:
+        map_paths, surface = unpacked.paths[: len(paths)], unpacked.paths[len(paths) :]
+        draft = _open_files(Path(folder), map_paths, surface, at, options)
+        _read_roads_and_recordings(draft)
+        _choose_surroundings(draft)
+        _read_maps(draft)
+        _lay_on_ground(draft)
+        _collect_objects(draft)
+        _choose_region(draft)
+        _choose_poles(draft)
+        _add_notes(draft)
+        _plan_traffic(draft)
+        draft.notes = [unpacked.user_text(note) for note in draft.notes]
+        return _write_scenario(draft)
 
 
 def _open_files(
-    folder: Path, maps: str | Path | Sequence[str | Path], at: tuple[float, float] | None, options: NewScenarioOptions
+    folder: Path,
+    maps: Sequence[Path],
+    surface: Sequence[Path],
+    at: tuple[float, float] | None,
+    options: NewScenarioOptions,
 ) -> _Draft:
-    """Check the options and the folder, and open the maps."""
-    options.check()
+    """Check the folder, and open the maps and the heights of roofs and trees."""
     name = scenario_files.check_new_folder(folder)
-    map_paths = [maps] if isinstance(maps, str | Path) else maps
-    files = map_readers.open_maps([Path(path) for path in map_paths])
-    return _Draft(folder, name, at, options, files, map_readers.open_surface(options.surface))
+    return _Draft(folder, name, at, options, map_readers.open_maps(maps), map_readers.open_surface(surface))
 
 
 def _read_roads_and_recordings(draft: _Draft) -> None:
@@ -469,6 +481,8 @@ def _read_maps(draft: _Draft) -> None:
     )
     draft.surface = ground_reference.read_terrain(draft.surface_files, context)
     check_used(context)
+    if context.alignment is not None and context.alignment.unit_m != 1.0:
+        draft.notes.append(_FEET_NOTE)
 
 
 def _lay_on_ground(draft: _Draft) -> None:

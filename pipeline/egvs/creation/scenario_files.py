@@ -7,6 +7,7 @@ functions that make single tables of ``scenario.toml`` are also used for the jun
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,6 +21,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.reading import name_in_errors
 from egvs.creation import junctions
 from egvs.creation.junctions import JunctionRegion, KerbsidePole
 from egvs.creation.map_parts import ImportCounts, MappedSolid
@@ -279,7 +281,8 @@ def publish_folder(folder: Path, contents: Iterable[tuple[str, FileContent]], ch
                 files.write_text(partial / name, content)
             else:
                 content(partial / name)
-        check(partial)
+        with name_in_errors(lambda text: text.replace(os.fspath(partial), os.fspath(folder))):
+            check(partial)
         if folder.is_dir():
             folder.rmdir()
         partial.replace(target)

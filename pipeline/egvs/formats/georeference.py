@@ -7,7 +7,7 @@ The world frame is right-handed, x east, y north, in metres. Its position on the
 
 Every pair is in the order x, y: easting before northing, longitude before latitude, whatever the order of the axes in a
 coordinate reference system. Degrees are WGS 84 unless a file declares another datum. PROJ (https://proj.org) does the
-work, through pyproj; no other module imports it.
+work, through pyproj; beside this module, only :mod:`egvs.formats.geotiff_keys` imports it.
 
 The coordinates of a file are metres of the world frame, degrees, or in the system that the file declares. Nothing is
 inferred from the numbers. They only reveal mistakes: a file is rejected when it lies far from the region of interest,
@@ -17,6 +17,7 @@ or when numbers declared as metres can only be degrees. The message says in whic
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -42,6 +43,10 @@ LOCAL_METRES = 'LOCAL_CS["World frame of the scenario",UNIT["metre",1],AXIS["Eas
 """Metres to the east and north of an unknown origin, as WKT."""
 
 _SAME_POSITION_M = 0.001
+_SYSTEM_HINT = 'Use a name that PROJ knows, for example "EPSG:25832".'
+_MAX_SHOWN = 100
+_HEIGHT_WORDS = re.compile(r"\+(?:geoidgrids|geoid_crs|vunits|vto_meter)=[^\s\"']*\s*")
+"""What a PROJ string says of heights, also inside WKT: PROJ cannot convert x and y where it lacks the named grid."""
 
 
 @dataclass(frozen=True)
@@ -117,19 +122,85 @@ class WorldFrame:
 
 
 def parse_crs(crs: Any, where: str) -> CRS:
-    """Return a coordinate reference system given in any form that PROJ knows; InputError when it is unknown.
+    """Return a coordinate reference system given in any form that PROJ knows.
 
-    Only the horizontal part of a compound system (with heights) is returned.
+    Only the horizontal part of a system with heights is returned: x and y can then be converted although PROJ lacks
+    the model of the geoid.
+
+    Parameters
+    ----------
+    crs
+        The system.
+    where
+        The file or key, for messages.
+
+    Raises
+    ------
+    InputError
+        When the system is unknown, or has no x and y that can be converted: systems that are geocentric or of heights
+        alone, of another planet, or that need a grid that is not installed. Local (engineering) systems are returned.
     """
+    try:
+        return _horizontal_crs(crs) if isinstance(crs, str) else _horizontal_part(crs)
+    except InputError as error:
+        raise InputError(where, error.problem, error.hint) from None
+
+
+@cache
+def _horizontal_crs(crs: str) -> CRS:
+    return _horizontal_part(_HEIGHT_WORDS.sub("", crs))
+
+
+def _horizontal_part(crs: Any) -> CRS:
+    """Return the horizontal part of a system; InputError, without a location, where parse_crs raises one."""
+    from pyproj.exceptions import ProjError
+
+    parsed = _parse_complete(crs)
+    horizontal = parsed.sub_crs_list[0] if parsed.is_compound else parsed
+    if horizontal.is_engineering:
+        return horizontal
+    if horizontal.is_geocentric or horizontal.is_vertical:
+        kind = "geocentric" if horizontal.is_geocentric else "a system of heights"
+        hint = "Convert the coordinates to a map projection in metres, for example UTM."
+        problem = f"expected a map projection or longitude and latitude, but {_shown_name(parsed)!r} is {kind}"
+        raise InputError("", problem, hint)
+    try:
+        _make_transformer(WGS84, horizontal)
+    except ProjError as error:
+        raise _no_conversion_error(horizontal, error) from None
+    return horizontal
+
+
+def _parse_complete(crs: Any) -> CRS:
+    """Return a system with its heights; InputError, without a location, when it is unknown."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
     try:
-        parsed = CRS.from_user_input(crs)
+        return CRS.from_user_input(crs)
     except (CRSError, TypeError, ValueError):
-        problem = f"unknown coordinate reference system {crs!r}"[:160]
-        raise InputError(where, problem, 'Use a name that PROJ knows, for example "EPSG:25832".') from None
-    return parsed.sub_crs_list[0] if parsed.is_compound else parsed
+        raise InputError("", f"unknown coordinate reference system {_shorten(str(crs))!r}", _SYSTEM_HINT) from None
+
+
+def _shown_name(crs: CRS) -> str:
+    return _shorten(crs.name if crs.name != "unknown" else crs.srs)
+
+
+def _shorten(text: str) -> str:
+    return f"{text[:_MAX_SHOWN]}..." if len(text) > _MAX_SHOWN else text
+
+
+def _no_conversion_error(crs: CRS, error: Exception) -> InputError:
+    """Return the error, without a location, for a system whose coordinates PROJ cannot convert."""
+    problem = f"PROJ cannot convert coordinates from or to {_shown_name(crs)!r}"
+    grids = re.findall(r"\+nadgrids=([^\s\"']+)", crs.srs) or re.findall(
+        r'PARAMETERFILE\["[^"]*","([^"]+)"', crs.to_wkt()
+    )
+    if grids:
+        problem += f": the grid {grids[0]} is not installed"
+        return InputError("", problem, "Name the system by its EPSG code, or install the grid with projsync.")
+    reason = re.sub(r".*Internal Proj Error: (?:\w+: )*", "", str(error)).partition(". ")[0].removesuffix(")")
+    return InputError("", f"{problem} ({reason})", _SYSTEM_HINT)
 
 
 def proj_string(crs: str, where: str) -> str:
@@ -138,28 +209,55 @@ def proj_string(crs: str, where: str) -> str:
 
     parsed = parse_crs(crs, where)
     if crs.strip().startswith("+proj="):
-        return crs.strip()
+        return _HEIGHT_WORDS.sub("", crs).strip()
     with warnings.catch_warnings():
         # a PROJ string cannot say everything, such as the names of axes
         warnings.simplefilter("ignore", UserWarning)
         return str(parsed.to_proj4())
 
 
-def height_unit_m(crs: Any, where: str) -> float:
-    """Return the length in metres of a height of 1 in a system; negative where its vertical axis points down.
+@dataclass(frozen=True)
+class HeightUnit:
+    """The unit of the heights of a system.
+
+    Attributes
+    ----------
+    metres
+        Length of a height of 1; negative where the vertical axis points down.
+    name
+        The unit as PROJ calls it: ``"metre"``, ``"US survey foot"``.
+    source
+        What states the unit: the name of the vertical system, or in words.
+    """
+
+    metres: float
+    name: str
+    source: str
+
+
+def height_unit(crs: Any, where: str) -> HeightUnit:
+    """Return the unit of the heights of a system.
 
     Without a vertical axis, heights have the unit of a map projection's other axes, and metres beside degrees.
     """
-    from pyproj import CRS
-
     parse_crs(crs, where)
-    parsed = CRS.from_user_input(crs)
+    parsed = _parse_complete(crs)
     for axis in parsed.axis_info:
-        if axis.direction == "up":
-            return float(axis.unit_conversion_factor)
-        if axis.direction == "down":
-            return -float(axis.unit_conversion_factor)
-    return float(parsed.axis_info[0].unit_conversion_factor) if parsed.is_projected else 1.0
+        if axis.direction in ("up", "down"):
+            factor = float(axis.unit_conversion_factor)
+            name = parsed.sub_crs_list[-1].name if parsed.is_compound else parsed.name
+            source = "its vertical system" if name == "unknown" else name
+            return HeightUnit(factor if axis.direction == "up" else -factor, str(axis.unit_name), source)
+    if parsed.is_geographic or not parsed.axis_info:
+        return HeightUnit(1.0, "metre", "assumed: the file declares no vertical system")
+    axis = parsed.axis_info[0]
+    source = "the unit of x and y: the file declares no vertical system"
+    return HeightUnit(float(axis.unit_conversion_factor), str(axis.unit_name), source)
+
+
+def height_unit_m(crs: Any, where: str) -> float:
+    """Return the length in metres of a height of 1 in a system, as :func:`height_unit`."""
+    return height_unit(crs, where).metres
 
 
 def is_north_first(crs: Any, where: str) -> bool:
@@ -191,9 +289,22 @@ def utm_epsg(lon_deg: float, lat_deg: float) -> int:
 
 @cache
 def _transformer(source: str, target: str) -> Transformer:
-    from pyproj import Transformer
+    from pyproj.exceptions import ProjError
 
-    return Transformer.from_crs(parse_crs(source, source), parse_crs(target, target), always_xy=True)
+    start, end = parse_crs(source, source), parse_crs(target, target)
+    try:
+        return _make_transformer(start, end)
+    except ProjError as error:
+        failed = _no_conversion_error(start, error)
+        raise InputError(f"{start.name} to {end.name}", failed.problem, failed.hint) from None
+
+
+def _make_transformer(source: Any, target: Any) -> Transformer:
+    from pyproj import Transformer
+    from pyproj.network import set_network_enabled  # type: ignore[attr-defined]
+
+    set_network_enabled(False)  # PROJ would download grids, if the environment says so
+    return Transformer.from_crs(source, target, always_xy=True)
 
 
 def _transform(source: str, target: str, xy: FloatArray, direction: str = "FORWARD") -> FloatArray:
@@ -313,7 +424,7 @@ class Georeference:
             if distance_m <= COUNTRY_M:
                 problem = (
                     f"expected metres of the world frame, got longitude and latitude: coordinates"
-                    f" {_format_span(xy_m)}, as degrees {_format_distance(distance_m)} from the region of interest"
+                    f" {_format_span(xy_m)}, as degrees {format_distance(distance_m)} from the region of interest"
                 )
                 raise InputError(where, problem, hint)
         self._check_near(WORLD_READING, xy_m, where, hint)
@@ -342,7 +453,10 @@ class Georeference:
         frame = self.frame
         crs = parse_crs(declared, where)
         if crs.is_engineering:
-            return WORLD_READING
+            unit = crs.axis_info[0] if crs.axis_info else None
+            if unit is None or unit.unit_conversion_factor in (0.0, 1.0):
+                return WORLD_READING
+            return CoordinateReading(f"{unit.unit_name} of {crs.name}", lambda xy: xy * unit.unit_conversion_factor)
         if frame is not None:
             return CoordinateReading(crs.name, lambda points: frame.from_crs(points, declared), where)
         if crs.is_projected and all(axis.unit_name == "metre" for axis in crs.axis_info[:2]):
@@ -357,7 +471,7 @@ class Georeference:
         if distance_m <= FAR_M:
             return
         problem = (
-            f"coordinates {_format_span(xy)} are {_format_distance(distance_m)} from the region of interest,"
+            f"coordinates {_format_span(xy)} are {format_distance(distance_m)} from the region of interest,"
             f" read as {reading.description}"
         )
         distances_m = {words: self.distance_m(points) for words, points in self._alternatives(xy)}
@@ -445,7 +559,8 @@ def _format_span(xy: FloatArray) -> str:
     return f"({x0:.10g} to {x1:.10g}, {y0:.10g} to {y1:.10g})"
 
 
-def _format_distance(distance_m: float) -> str:
+def format_distance(distance_m: float) -> str:
+    """Return a distance for a message: kilometres from 10 km on, else metres."""
     if not np.isfinite(distance_m):
         return "infinitely far"
     return f"{distance_m / 1000:,.0f} km" if distance_m >= 10_000 else f"{distance_m:.0f} m"

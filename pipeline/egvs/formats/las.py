@@ -3,7 +3,12 @@
 LAZ files are decompressed by another process (:mod:`egvs.formats.reader_process`): the decompressor allocates as much
 memory as a damaged file asks for, and ends its process when there is not enough.
 
-A file may declare its coordinate reference system (:func:`crs_of`).
+Points that the file marks as errors have NaN as coordinates, like missing returns, and are counted: those with the flag
+*withheld*, and those of the noise classes 7 and 18. All others count, whatever their class: synthetic points and those
+of overlapping strips describe the surface as well. Source: ASPRS LAS 1.4 R15, tables 8, 16 and 17.
+
+A file may declare its coordinate reference system (:func:`crs_of`), as WKT or as GeoTIFF keys
+(:mod:`egvs.formats.geotiff_keys`), in records before or after the points.
 """
 
 from __future__ import annotations
@@ -11,7 +16,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -19,7 +24,8 @@ from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE, translate_errors
-from egvs.formats.point_clouds import PointChunk, stack_columns
+from egvs.formats.geotiff_keys import GeoKeys
+from egvs.formats.point_clouds import NOISE, PointChunk, drop_marked, stack_columns
 from egvs.formats.reader_process import Block, read_blocks, serve
 
 if TYPE_CHECKING:
@@ -30,6 +36,10 @@ _CHUNK_SIZE_AT = 12
 """Position of the size of chunks in the record of LASzip."""
 _CANNOT_READ = "cannot be read as LAS"
 _INSTALL_HINT = "Run pip install 'egvs[las]'."
+_WITHHELD = "withheld"
+_CRS_USER, _WKT_RECORD, _KEY_RECORDS = b"LASF_Projection", 2112, (34735, 34736, 34737)
+_WKT_FLAG = 1 << 4
+_MAX_RECORDS, _MAX_RECORD_BYTES = 10_000, 1_000_000
 
 
 def read(path: Path, where: str) -> FloatArray:
@@ -40,8 +50,8 @@ def read(path: Path, where: str) -> FloatArray:
         points = np.empty((declared, 3))
         filled = 0
         for chunk in _checked_chunks(path, where, declared):
-            points[filled : filled + len(chunk)] = chunk
-            filled += len(chunk)
+            points[filled : filled + len(chunk.points_m)] = chunk.points_m
+            filled += len(chunk.points_m)
     return points
 
 
@@ -49,8 +59,7 @@ def stream(path: Path, where: str) -> Iterator[PointChunk]:
     """Yield the points in chunks; the file does not say where the scanner stood. Errors are those of :func:`read`."""
     with translate_errors(where, COMPLETE_FILE, _CANNOT_READ):
         declared = _check_file(path, where)
-        for chunk in _checked_chunks(path, where, declared):
-            yield PointChunk(0, None, chunk)
+        yield from _checked_chunks(path, where, declared)
 
 
 def _check_file(path: Path, where: str) -> int:
@@ -82,10 +91,22 @@ def _check_file(path: Path, where: str) -> int:
         problem = f"the header declares {expected} bytes of points, but the file contains {actual}"
         raise InputError(where, problem, COMPLETE_FILE)
     most = min(actual, (after_points or size) - (size - actual))
-    if most - expected >= expected // max(1, declared) > 0:
+    points_end = size - actual + expected
+    if most - expected >= expected // max(1, declared) > 0 and not _is_padding(path, points_end, most - expected):
         problem = f"the header declares {declared} points, but there are {most - expected} bytes after the last one"
         raise InputError(where, problem, COMPLETE_FILE)
     return declared
+
+
+def _is_padding(path: Path, start: int, length: int) -> bool:
+    """Return whether a part of a file has zero bytes only: programs fill files up to whole blocks."""
+    with path.open("rb") as file:
+        file.seek(start)
+        while length > 0 and (content := file.read(min(length, _CHUNK))):
+            if content.strip(b"\0"):
+                return False
+            length -= len(content)
+    return True
 
 
 def _first_record_after_points(header: laspy.LasHeader) -> int:
@@ -98,11 +119,11 @@ def _first_record_after_points(header: laspy.LasHeader) -> int:
     return min(starts, default=0)
 
 
-def _checked_chunks(path: Path, where: str, declared: int) -> Iterator[FloatArray]:
+def _checked_chunks(path: Path, where: str, declared: int) -> Iterator[PointChunk]:
     """Yield the points in chunks; InputError unless there are as many as the header declares."""
     count = 0
     for chunk in _unpacked_chunks(path, where) if _is_packed(path) else _chunks(path):
-        count += len(chunk)
+        count += len(chunk.points_m)
         if count > declared:
             problem = f"{_CANNOT_READ} (more points than its header declares)"
             raise InputError(where, problem, COMPLETE_FILE)
@@ -112,13 +133,13 @@ def _checked_chunks(path: Path, where: str, declared: int) -> Iterator[FloatArra
         raise InputError(where, problem, COMPLETE_FILE)
 
 
-def _unpacked_chunks(path: Path, where: str) -> Iterator[FloatArray]:
+def _unpacked_chunks(path: Path, where: str) -> Iterator[PointChunk]:
     """Yield the points of a LAZ file, decompressed by another process."""
     for block in read_blocks(__name__, path, where, _CANNOT_READ):
-        yield block.points_m
+        yield PointChunk(0, None, block.points_m, block.values)
 
 
-def _chunks(path: Path) -> Iterator[FloatArray]:
+def _chunks(path: Path) -> Iterator[PointChunk]:
     """Yield the points in chunks."""
     import laspy
 
@@ -127,25 +148,67 @@ def _chunks(path: Path) -> Iterator[FloatArray]:
     quiet = np.errstate(over="ignore", invalid="ignore")  # points that a scale makes infinite are dropped
     with quiet, path.open("rb") as file, laspy.open(file, read_evlrs=False, laz_backend=backend) as las:
         for chunk in las.chunk_iterator(_CHUNK):
-            yield stack_columns([chunk.x, chunk.y, chunk.z])
+            points = stack_columns([chunk.x, chunk.y, chunk.z])
+            marks = {_WITHHELD: np.asarray(chunk.withheld, dtype=np.bool_)}
+            classes = np.asarray(chunk.classification)
+            marks |= {name: classes == number for number, name in NOISE.items()}
+            yield PointChunk(0, None, points, drop_marked(points, marks))
 
 
 def crs_of(path: Path, where: str) -> str | None:
-    """Return the coordinate reference system that the file's header declares, as WKT; None if it declares none.
+    """Return the coordinate reference system that the file declares, in a form of PROJ; None if it declares none.
 
-    For a file that :func:`read` has read. InputError at ``where`` when the declaration is damaged.
+    Where a file has both kinds of records, the flag of its header says which counts; where the text of that one is
+    empty, the other.
+
+    For a file that :func:`read` has read. InputError at ``where`` when the declaration is damaged, or states something
+    that PROJ cannot use.
     """
-    import laspy
+    with path.open("rb") as file:
+        head = file.read(375)
+        records = _projection_records(file, head)
+    wkt = records.get(_WKT_RECORD, b"").decode("utf-8", "replace").strip("\0 \t\r\n\"'")
+    prefers_wkt = bool(struct.unpack_from("<H", head, 6)[0] & _WKT_FLAG)
+    if wkt and (prefers_wkt or not records.get(_KEY_RECORDS[0])):
+        return wkt
+    try:
+        return GeoKeys.from_records(records).to_crs() or wkt or None
+    except ValueError as error:
+        if wkt:
+            return wkt
+        hint = "Write its reference system as WKT, for example with pdal translate --writers.las.a_srs=EPSG:CODE."
+        raise InputError(where, str(error), hint) from None
 
-    with (
-        translate_errors(where, COMPLETE_FILE, "the coordinate reference system in the header cannot be read"),
-        path.open("rb") as file,
-        laspy.open(file, closefd=False, read_evlrs=False) as las,
-    ):
-        crs = las.header.parse_crs()
-        if crs is None:
-            return None
-        return str(crs.to_wkt())
+
+class _RecordTable(NamedTuple):
+    """Where variable length records start, how many there are, and the format of the head of each."""
+
+    start: int
+    number: int
+    head: str
+
+
+def _projection_records(file: BinaryIO, head: bytes) -> dict[int, bytes]:
+    """Return the records of a reference system by number, those before the points first."""
+    header_size, _, count = struct.unpack_from("<HII", head, 94)
+    tables = [_RecordTable(header_size, count, "<H16sHH32x")]
+    if header_size >= 375 and len(head) >= 375 and head[25] >= 4:
+        start, count = struct.unpack_from("<QI", head, 235)
+        tables.append(_RecordTable(start, count, "<H16sHQ32x"))
+    records: dict[int, bytes] = {}
+    for table in tables:
+        at = table.start
+        size = struct.calcsize(table.head)
+        for _ in range(min(table.number, _MAX_RECORDS)):
+            file.seek(min(at, 1 << 62))
+            start_of_record = file.read(size)
+            if len(start_of_record) < size:
+                break
+            _, user, number, length = struct.unpack(table.head, start_of_record)
+            if user.rstrip(b"\0") == _CRS_USER and number in (_WKT_RECORD, *_KEY_RECORDS):
+                records.setdefault(number, file.read(min(length, _MAX_RECORD_BYTES)))
+            at += size + length
+    return records
 
 
 def _check_header(where: str, head: bytes, size: int) -> bool:
@@ -203,4 +266,4 @@ def _number_at(file: BinaryIO, kind: str, offset: int) -> int:
 
 
 if __name__ == "__main__":
-    serve(lambda path: (Block.of_points({}, chunk) for chunk in _chunks(path)))
+    serve(lambda path: (Block.of_points(dict(chunk.marked), chunk.points_m) for chunk in _chunks(path)))

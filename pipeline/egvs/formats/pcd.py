@@ -27,7 +27,16 @@ from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
-from egvs.formats.point_clouds import AXES, PointChunk, RecordLayout, pack_records, parse_count, parse_float
+from egvs.formats.point_clouds import (
+    AXES,
+    CLASS_FIELDS,
+    PointChunk,
+    RecordLayout,
+    drop_noise,
+    pack_records,
+    parse_count,
+    parse_float,
+)
 
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _UNIT_TOLERANCE = 1e-3
@@ -99,7 +108,8 @@ def stream(path: Path, where: str) -> Iterator[PointChunk]:
     with open_input(path) as file:
         viewpoint = _viewpoint(where, _read_header(where, file.read()).words.get("VIEWPOINT"))
     station_m = None if viewpoint == _IDENTITY else np.array(viewpoint[:3])
-    yield PointChunk(0, station_m, read(path, where))
+    points = read(path, where)
+    yield PointChunk(0, station_m, points, drop_noise(points, read_field(path, where, CLASS_FIELDS)))
 
 
 def write(path: Path, points_m: FloatArray) -> None:
@@ -189,10 +199,14 @@ def _viewpoint(where: str, words: list[str] | None) -> tuple[float, ...]:
         value = parse_float(word)
         if value is not None and math.isfinite(value):
             values.append(value)
-    length = math.hypot(*values[3:])
-    if len(values) != len(words) or len(values) != 7 or abs(length - 1) > _UNIT_TOLERANCE:
-        hint = "Write a translation and a unit quaternion: tx ty tz qw qx qy qz."
+    hint = "Write a translation and a unit quaternion: tx ty tz qw qx qy qz; 0 0 0 1 0 0 0 for none."
+    if len(values) != len(words) or len(values) != 7:
         raise InputError(where, f"VIEWPOINT: expected seven numbers, got {' '.join(words)!r}", hint)
+    length = math.hypot(*values[3:])
+    if abs(length - 1) > _UNIT_TOLERANCE:
+        quaternion = " ".join(words[3:])
+        problem = f"VIEWPOINT: expected a quaternion of length 1, got {quaternion!r} of length {length:.4g}"
+        raise InputError(where, problem, hint)
     return (*values[:3], *(value / length for value in values[3:]))
 
 
@@ -222,7 +236,10 @@ def _unpack(where: str, body: bytes, expected: int) -> bytearray:
         problem = f"expected {packed} bytes of packed points, got {len(body) - 8} bytes"
         raise InputError(where, problem, COMPLETE_FILE)
     limits.UNPACKED.check_bytes(where, size)
-    unpacked = _decompress_lzf(body[8 : 8 + packed], size)
+    block = body[8 : 8 + packed]
+    unpacked = _decompress_lzf(block, size)
+    if unpacked is None and packed == size:  # stored as they are, where they cannot be compressed
+        unpacked = bytearray(block)
     if unpacked is None:
         raise InputError(where, "the packed points are not valid LZF data", COMPLETE_FILE)
     return unpacked

@@ -1,7 +1,8 @@
 """Read and write point clouds of any format in the table of readers (:mod:`egvs.core.readers`).
 
 Steps of :func:`read_points`: find the format by the file's suffix; read the file; drop, and count, the points that are
-NaN or infinite, which mark missing returns. Incomplete files are rejected.
+NaN or infinite, which mark missing returns, and those that the file marks as errors (:data:`NOISE`). Incomplete files
+are rejected.
 
 The module of a format has a function ``read`` and may have ``write``, ``crs_of``, ``stream`` and ``read_field``
 (:class:`PointFormat`). The formats of this program are in :mod:`egvs.formats.readers`; other packages may add theirs
@@ -22,6 +23,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -34,6 +36,7 @@ from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
 from egvs.core.readers import Reader
 from egvs.core.reading import COMPLETE_FILE, describe_exception, translate_errors
+from egvs.formats.georeference import parse_crs
 
 KIND = "points"
 """Kind of the readers of point clouds."""
@@ -83,11 +86,42 @@ class PointChunk(NamedTuple):
         Where the scanner stood, (3,) float64 in the frame of the points; None if the file does not say.
     points_m
         (n, 3) float64, including points that are not finite.
+    marked
+        How many of these points the file marks as errors, by the mark; their coordinates are NaN.
     """
 
     scan: int
     station_m: FloatArray | None
     points_m: FloatArray
+    marked: Mapping[str, int] = MappingProxyType({})
+
+
+NOISE = {7: "noise (class 7)", 18: "noise (class 18)"}
+"""Classes of LAS whose points are errors of measurement, low and high, with their names in notes."""
+
+CLASS_FIELDS = ("classification", "Classification", "scalar_Classification")
+"""Names of the field with the class of LAS in PCD and PLY files of PDAL and CloudCompare."""
+
+
+def drop_marked(points_m: FloatArray, marks: Mapping[str, NDArray[np.bool_]]) -> dict[str, int]:
+    """Set points, (n, 3), with a mark to NaN in place, and return how many have each mark; the first one counts."""
+    counts = {}
+    left = np.ones(len(points_m), dtype=np.bool_)
+    for name, mask in marks.items():
+        count = int(np.count_nonzero(mask & left))
+        if count:
+            counts[name] = count
+            left &= ~mask
+    if counts:
+        points_m[~left] = np.nan
+    return counts
+
+
+def drop_noise(points_m: FloatArray, classes: FloatArray | None) -> dict[str, int]:
+    """Set points, (n, 3), of the noise classes to NaN in place, and return their numbers; none without classes (n,)."""
+    if classes is None:
+        return {}
+    return drop_marked(points_m, {name: classes == number for number, name in NOISE.items()})
 
 
 @runtime_checkable
@@ -118,6 +152,7 @@ def read_points(path: Path, where: str) -> tuple[FloatArray, int]:
     """
     where = _with_path(where, path)
     points = _read_all(path, where)
+    drop_noise(points, read_field(path, where, CLASS_FIELDS))
     finite = np.isfinite(points).all(axis=1)
     dropped = len(points) - int(np.count_nonzero(finite))
     if dropped == len(points):
@@ -176,7 +211,8 @@ def stream_points(path: Path, where: str) -> Iterator[PointChunk]:
     where = _with_path(where, path)
     point_format = _load_format(_find_reader(path, where))
     if not isinstance(point_format, StreamedFormat):
-        yield PointChunk(0, None, _read_all(path, where))
+        points = _read_all(path, where)
+        yield PointChunk(0, None, points, drop_noise(points, read_field(path, where, CLASS_FIELDS)))
         return
     limits.checked_size(path, limits.FILE, where)
     with translate_errors(where, COMPLETE_FILE):
@@ -216,13 +252,18 @@ def read_field(path: Path, where: str, names: Sequence[str]) -> FloatArray | Non
 
 
 def point_cloud_crs(path: Path, where: str) -> str | None:
-    """Return the coordinate reference system that a point cloud declares, as WKT; None if it declares none.
+    """Return the coordinate reference system that a point cloud declares; None if it declares none.
 
-    For a file that :func:`read_points` has read; InputError at ``where`` when the declaration is damaged.
+    For a file that :func:`read_points` has read; InputError at ``where`` when the declaration is damaged, or when PROJ
+    does not know the system.
     """
     where = _with_path(where, path)
     point_format = _load_format(_find_reader(path, where))
-    return point_format.crs_of(path, where) if isinstance(point_format, LocatedFormat) else None
+    crs = point_format.crs_of(path, where) if isinstance(point_format, LocatedFormat) else None
+    if not (crs or "").strip(" \t\r\n\0\"'"):
+        return None
+    parse_crs(crs, where)
+    return crs
 
 
 def format_of_file(path: Path, where: str) -> str:
@@ -291,6 +332,8 @@ def _known_suffix(path: Path, where: object, known: Iterable[str]) -> str:
 
 
 AXES = ("x", "y", "z")
+PADDING = b"\0 \t\n\r\v\f"
+"""Bytes that may follow the last point: programs fill files up to whole blocks."""
 NUMBER_HINT = "Use a number, or nan for a missing return."
 
 
@@ -378,9 +421,9 @@ class RecordLayout:
         return np.ascontiguousarray(table[:, self.columns], dtype=np.float64)
 
     def from_records(self, body: memoryview, last: bool = True) -> FloatArray:
-        """Return the fields that are read from binary records; only white space may follow the ``last`` ones."""
+        """Return the fields that are read from binary records; only padding may follow the ``last`` ones."""
         expected = self.n * self.size
-        if len(body) < expected or (last and bytes(body[expected:]).strip()):
+        if len(body) < expected or (last and bytes(body[expected:]).strip(PADDING)):
             problem = (
                 f"the header declares {self.n} points of {self.size} bytes ({expected} bytes), but the file contains"
                 f" {len(body)} bytes"

@@ -1,4 +1,4 @@
-"""Layers of GIS files as GeoJSON documents: GeoPackage, Shapefile, KML and GeoParquet.
+"""Layers of GIS files as GeoJSON documents: GeoPackage, Shapefile, KML and GeoParquet, also KMZ and zipped ones.
 
 GeoPackage, Shapefile and KML are read by GDAL in a process of its own (:mod:`egvs.formats.gdal_layers`, extra ``gis``),
 GeoParquet (https://geoparquet.org) by pyarrow in another one (:mod:`egvs.formats.parquet_process`). The result is a
@@ -27,6 +27,8 @@ from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE
+from egvs.core.wording import list_first
+from egvs.formats import archives
 
 if TYPE_CHECKING:
     from egvs.formats import parquet_process
@@ -36,7 +38,12 @@ GIS_FORMATS = {
 }  # fmt: skip
 """Formats by the suffix of their files."""
 
+KML_SUFFIXES = (".kml", ".kmz")
+_ARCHIVES = (".kmz", archives.SUFFIX)
+_KMZ_FILE = "doc.kml"
+
 _SHAPEFILE_PARTS = (".dbf", ".prj", ".cpg", ".shx", ".DBF", ".PRJ", ".CPG", ".SHX")
+_MAX_NAMED_FILES = 10
 _EXPORT_HINT = "Export it again, or use GeoJSON or CSV."
 _KML_FIELDS = (
     "id", "timestamp", "begin", "end", "altitudeMode", "tessellate", "extrude", "visibility", "drawOrder", "icon",
@@ -45,7 +52,7 @@ _KML_FIELDS = (
 
 def is_gis_file(path: Path) -> bool:
     """Return whether :func:`read_gis_file` reads a file; its suffix decides."""
-    return path.suffix.lower() in GIS_FORMATS
+    return path.suffix.lower() in (*GIS_FORMATS, *_ARCHIVES)
 
 
 def companion_files(path: Path) -> list[Path]:
@@ -78,6 +85,9 @@ def read_gis_file(path: Path, geometry: str) -> dict[str, Any]:
     MissingExtraError
         When pyogrio is not installed.
     """
+    if path.suffix.lower() in _ARCHIVES:
+        with archives.unpack_archives([path], _ARCHIVES) as unpacked:
+            return read_gis_file(_layer_in(unpacked.paths[0]), geometry)
     kind = GIS_FORMATS[path.suffix.lower()]
     table, geometry_column, crs = _read_geoparquet(path) if kind == "GeoParquet" else _read_gdal(path, kind, geometry)
     if not crs:
@@ -88,6 +98,20 @@ def read_gis_file(path: Path, geometry: str) -> dict[str, Any]:
     features = [_feature(row, geometry_column, path) for row in table.to_pylist()]
     named_crs = {"type": "name", "properties": {"name": crs}}
     return {"type": "FeatureCollection", "crs": named_crs, "features": features}
+
+
+def _layer_in(folder: Path) -> Path:
+    """Return the only GIS file of an unpacked archive; of a KMZ, the one that its standard names."""
+    if not folder.is_dir():
+        raise InputError(folder, "expected a file", "Check the path.")
+    inside = sorted(path for path in folder.rglob("*") if path.suffix.lower() in GIS_FORMATS)
+    if folder.suffix.lower() == ".kmz":
+        inside = [path for path in inside if path == folder / _KMZ_FILE] or inside
+    if len(inside) != 1:
+        listed = list_first([path.name for path in inside], _MAX_NAMED_FILES) or "none"
+        formats = ", ".join(dict.fromkeys(GIS_FORMATS.values()))
+        raise InputError(folder, f"expected one file of {formats}, got {listed}", "Make an archive of one of them.")
+    return inside[0]
 
 
 def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str | None]:

@@ -147,7 +147,11 @@ def read_features(path: Path, world: Georeference, *, has_relief: bool = False) 
     for number, feature in enumerate(document["features"]):
         where = f"{path}: feature {number}"
         columns = _feature_columns(where, feature, reading)
-        if has_relief and path.suffix.lower() == ".kml" and len(feature["geometry"]["coordinates"]) > 2:
+        if (
+            has_relief
+            and path.suffix.lower() in vector_files.KML_SUFFIXES
+            and len(feature["geometry"]["coordinates"]) > 2
+        ):
             problem = "expected the field z_m, since the ground is not at z = 0, got an altitude above the ground"
             hint = "Add z_m (extended data): the altitude + z of the ground there."
             raise InputError(f"{path}: site {columns.get('site', number)}", problem, hint)

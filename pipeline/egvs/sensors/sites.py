@@ -197,7 +197,7 @@ def _site_rows(scenario: Scenario, path: Path) -> tuple[Iterable[SiteRow], list[
     if config.file is not None:
         world = geolocation.scenario_georeference(scenario)
         if path.suffix.lower() in (".geojson", ".json") or vector_files.is_gis_file(path):
-            is_kml = path.suffix.lower() == ".kml"
+            is_kml = path.suffix.lower() in vector_files.KML_SUFFIXES
             return site_files.read_features(path, world, has_relief=is_kml and _has_relief(scenario)), []
         return site_files.read_table(path, world)
     if config.grid is not None:

@@ -95,9 +95,26 @@ def test_objects_outside_the_window_are_left_out(tmp_path: Path) -> None:
     result = citygml.read_solids([path], CONTEXT)
     assert [mesh.name for mesh in result.meshes] == ["near"]
     assert result.counts.dropped == {"out_of_range": {"building": 1}}
-    path = write_model(tmp_path / "b.gml", house("far", 1300, 0))
-    result = citygml.read_solids([path], CONTEXT)
-    assert result.notes == ("b.gml: none of its 1 object is within reach; the nearest is 1.0 km away.",)
+    for east_m, distance in ((1300, "1000 m"), (335, "35 m")):
+        path = write_model(tmp_path / "b.gml", house("far", east_m, 0))
+        (note,) = citygml.read_solids([path], CONTEXT).notes
+        assert (
+            note == f"b.gml: none of its 1 object is within reach of the sensors; the nearest is {distance} beyond it."
+        )
+
+
+def test_alignment_places_a_model_in_a_system_that_proj_does_not_know(tmp_path: Path) -> None:
+    """A triangle 30 m long and 9 high, in metres and in feet."""
+    ring = [(0.0, 0.0, 9.0), (30.0, 0.0, 9.0), (30.0, 30.0, 9.0)]
+    surface = nest(multi_surface([polygon(ring)]), "lod1MultiSurface")
+    path = write_model(tmp_path / "a.gml", city_object("Building", "h", surface), srs_name="Local")
+    points = np.array([[0.0, 0.0], [30.0, 0.0]])
+    for unit_m in (1.0, 0.3048):
+        alignment = Alignment(points, points * unit_m, unit_m)
+        (mesh,) = citygml.read_solids([path], MapContext(FRAME, CONTEXT.window, alignment)).meshes
+        np.testing.assert_allclose(mesh.vertices_m.max(axis=0), np.array([30, 30, 9]) * unit_m, atol=1e-9)
+    with pytest.raises(InputError, match=r"unknown coordinate reference system 'Local'.* Or: Give two of its points"):
+        citygml.read_solids([path], CONTEXT)
 
 
 def test_swapped_axes_are_an_error(tmp_path: Path) -> None:

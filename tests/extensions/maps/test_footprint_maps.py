@@ -159,3 +159,25 @@ def test_rejects_damaged_file(tmp_path: Path, content: str, message: str) -> Non
     (tmp_path / "a.geojson").write_text(content)
     with pytest.raises(InputError, match=message):
         read(tmp_path / "a.geojson")
+
+
+def named(crs: str) -> dict[str, Any]:
+    return {"type": "name", "properties": {"name": crs}}
+
+
+def test_a_system_whose_geoid_grid_is_missing_places_footprints(tmp_path: Path) -> None:
+    ring = [[540_020.0, 5_630_030.0], [540_030.0, 5_630_030.0], [540_030.0, 5_630_040.0], [540_020.0, 5_630_030.0]]
+    crs = "+proj=utm +zone=32 +ellps=GRS80 +geoidgrids=no_such_grid.gtx +vunits=m +units=m +no_defs"
+    (solid,) = read(write(tmp_path / "a.geojson", feature(ring, height=9), crs=named(crs))).solids
+    np.testing.assert_allclose(solid.geometry.bounds, (20, 30, 30, 40), atol=1e-6)
+
+
+def test_an_alignment_replaces_a_system_that_proj_does_not_know(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.geojson", feature([[0, 0], [9, 0], [9, 9], [0, 0]]), crs=named("Town grid"))
+    points = np.array([[0.0, 0.0], [50.0, 0.0]])
+    (solid,) = read(path, MapContext(FRAME, CONTEXT.window, Alignment(points, points))).solids
+    np.testing.assert_allclose(solid.geometry.bounds, (0, 0, 9, 9), atol=1e-6)
+    with pytest.raises(
+        InputError, match=r"unknown coordinate reference system 'Town grid'.* Or: Give two of its points"
+    ):
+        read(path)

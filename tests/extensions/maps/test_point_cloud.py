@@ -16,6 +16,7 @@ from shapely.geometry import box
 import egvs
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Roi
+from egvs.creation.alignment import make_alignment
 from egvs.creation.map_parts import Alignment, MapContext, MappedMesh
 from egvs.extensions.maps.point_clouds import reader as point_cloud
 from egvs.extensions.maps.point_clouds.as_built_view import AsBuiltMap, unseen_shares
@@ -193,10 +194,64 @@ def test_las_file_in_another_reference_system(tmp_path: Path) -> None:
     np.testing.assert_allclose(vertices[:, 2], 37.5, atol=1e-9)
 
 
+@needs_laspy
+def test_heights_in_feet_and_points_marked_as_noise(tmp_path: Path) -> None:
+    """A plane 300 m high in US survey feet, and a cloud of noise above it, in UTM 15 north by GeoTIFF keys."""
+    from tests.formats.test_las_header import SURVEY_FOOT_M, UTM_15, write_las
+
+    xs, ys = (axis.ravel() for axis in np.meshgrid(np.arange(0, 20, 0.5), np.arange(0, 20, 0.5)))
+    x, y = np.tile(xs, 2) + 500_000, np.tile(ys, 2) + 4_600_000
+    z = np.repeat([300.0, 304.0], len(xs)) / SURVEY_FOOT_M
+    path = write_las(
+        tmp_path / "a.las",
+        UTM_15 | {4096: 6360, 4099: 9003},
+        points=np.column_stack([x, y, z]),
+        classification=np.repeat([2, 18], len(xs)),
+    )
+    frame = WorldFrame("EPSG:32615", (-500_000.0, -4_600_000.0))
+    result = point_cloud.read_solids([path], MapContext(frame, box(-50, -50, 50, 50)))
+    assert [mesh.kind for mesh in result.meshes] == ["ground"]
+    np.testing.assert_allclose(result.meshes[0].vertices_m[:, 2], 300.0, atol=0.001)
+    assert result.counts.dropped == {"marked": {"point": 1600}}
+    assert " 1,600 marked as noise (class 18), 0 on moving objects" in result.notes[0]
+    assert result.notes[3] == (
+        "Heights in the file are in US survey feet and converted to metres (NAVD88 height (ftUS))."
+    )
+
+
+@needs_laspy
+@pytest.mark.parametrize("text", ["Local", '""', "NOT A SYSTEM[]"])
+def test_alignment_places_a_file_whose_reference_system_is_no_text_of_one(tmp_path: Path, text: str) -> None:
+    from tests.formats.test_las_header import write_las
+
+    path = write_las(tmp_path / "a.las", wkt=text, points=np.random.default_rng(0).uniform(0, 9, (500, 3)))
+    result = point_cloud.read_solids([path], CONTEXT)
+    assert result.notes[3] == "Heights in the file are in metres (from the distance of the points of --align)."
+    with pytest.raises(InputError, match=r"a\.las: .*coordinate reference system.* Give two of its points .*--align"):
+        point_cloud.read_solids([path], MapContext(None, box(-30, -30, 30, 30)))
+
+
+def test_alignment_of_a_file_in_feet(tmp_path: Path) -> None:
+    """Two points 100 feet apart in the file are 30.48 m apart on the ground; heights are feet, too."""
+    corners = np.array([(x, y, 10.0) for x in range(0, 101, 2) for y in range(0, 101, 2)], dtype=np.float64)
+    write_points(tmp_path / "a.ply", corners)
+    alignment = make_alignment([((0.0, 0.0), (0.0, 0.0)), ((100.0, 0.0), (30.48, 0.0))], None)
+    result = point_cloud.read_solids([tmp_path / "a.ply"], MapContext(None, box(-50, -50, 50, 50), alignment))
+    vertices = result.meshes[0].vertices_m
+    np.testing.assert_allclose(vertices.max(axis=0), [30.48, 30.48, 3.048], atol=0.31)
+    np.testing.assert_allclose(vertices[:, 2], 3.048, atol=1e-9)
+    xy_m = np.array([[3.0, -4.0]])
+    np.testing.assert_allclose(alignment.to_world(alignment.from_world(xy_m)), xy_m, atol=1e-12)
+    with pytest.raises(InputError, match=r"the points are 100\.00 apart in the file and 50\.00 m on the ground"):
+        make_alignment([((0.0, 0.0), (0.0, 0.0)), ((100.0, 0.0), (50.0, 0.0))], None)
+
+
 def test_messages(tmp_path: Path, survey: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r"0\.pcd: the file declares no coordinate reference system\. Give two"):
         point_cloud.read_solids(survey[:1], MapContext(None, box(-30, -30, 30, 30)))
-    with pytest.raises(InputError, match=r"0\.pcd: none of its [\d,]+ points is in the window around the roads"):
+    with pytest.raises(
+        InputError, match=r"0\.pcd: none of its [\d,]+ points is in the window around the roads \(\d+ m from it\)"
+    ):
         point_cloud.read_solids(survey[:1], MapContext(None, box(500, 500, 600, 600), SAME_FRAME))
     write_points(tmp_path / "far.pcd", np.array([[1e300, 0, 0]]))
     with pytest.raises(InputError, match=r"far\.pcd: expected coordinates of at most 1e\+08, got 1e\+300"):

@@ -44,7 +44,27 @@ def test_only_one_reader_accepts_a_file(tmp_path: Path, name: str, packed: bool)
         assert tracks.names == ("1", "2") and tracks.classes == ("car", "car")
 
 
-@pytest.mark.parametrize("head", [b"", b"\x00\xff\xfe", b"\x1f\x8b\x00", b"," * 5000, b"{}", b"PAR1", b"\xff" * 5000])
-def test_no_reader_fails_on_other_files(head: bytes) -> None:
-    for module in modules():
-        assert not module.can_open(Path("other.bin"), head)
+@pytest.mark.parametrize(
+    "head", [b"", b"\x00\xff\xfe", b"\x1f\x8b\x00", b"," * 5000, b"{}", b"[]", b"PAR1", b"\xff" * 5000]
+)
+@pytest.mark.parametrize("name", ["other.bin", "other.json"])
+def test_no_reader_accepts_other_files(tmp_path: Path, name: str, head: bytes) -> None:
+    path = tmp_path / name
+    path.write_bytes(head)
+    for reader in readers.list_readers(track_readers.KIND):
+        assert not (reader.may_open(path, head) and readers.load_reader(reader).can_open(path, head))
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "name"),
+    [
+        ("{", '"openlabel": {"frames": {}}}', "OpenLABEL"),
+        ("[{", '"3d_location": {}}]', "DAIR-V2X or V2X-Seq labels"),
+    ],
+)
+def test_member_that_tells_the_format_may_come_last(tmp_path: Path, start: str, end: str, name: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(f'{start}"a": "{"x" * 2 * HEAD_BYTES}", {end}')
+    for kind in ("tracks", "labels"):
+        reader = readers.find_reader(kind, path)
+        assert reader is not None and reader.name == name

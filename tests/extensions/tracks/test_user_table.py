@@ -226,6 +226,17 @@ def test_projected_coordinates_are_unchanged_and_have_crs(tmp_path: Path) -> Non
     assert tracks.length_m[0] == pytest.approx(4 * 0.3048) and tracks.z_m[0] == pytest.approx(3 * 0.3048)
 
 
+def test_a_system_whose_geoid_grid_is_missing_gives_positions(tmp_path: Path) -> None:
+    path = tmp_path / "own.csv"
+    path.write_text(CSV.replace("10,20", "293500,5629700"))
+    crs = "+proj=utm +zone=32 +datum=WGS84 +geoidgrids=no_such_grid.gtx +vunits=m +units=m +no_defs"
+    tracks = user_table.read(path, mapping(**FULL, crs=crs))
+    world = WorldFrame("EPSG:32632", (-293_000.0, -5_629_000.0))
+    assert tracks.frame.crs is not None
+    xy_m = world.from_crs(np.column_stack([tracks.x_m, tracks.y_m]), tracks.frame.crs)
+    np.testing.assert_allclose(xy_m[0], (500, 700), atol=1e-6)
+
+
 @pytest.mark.parametrize(("convention", "yaw"), [("cw_from_north", 90.0), ("ccw_from_east", 0.0)])
 def test_degrees_become_utm_and_yaw_follows_the_grid(tmp_path: Path, convention: str, yaw: float) -> None:
     """A car at Aachen that heads due east moves along its yaw in UTM zone 32."""
@@ -250,6 +261,8 @@ def test_unusable_systems_and_places_get_one_message(tmp_path: Path) -> None:
         ("EPSG:1", "scenario.toml: traffic.track_columns: crs: unknown coordinate reference system 'EPSG:1'"),
         ("EPSG:2229", "traffic.track_columns: crs: EPSG:2229"),  # US survey feet
         ("WGS", "unknown coordinate reference system 'WGS'"),
+        ("+proj=utm +zone=32 +ellps=bessel +nadgrids=no_such_grid.gsb", "the grid no_such_grid.gsb is not installed"),
+        ("EPSG:4978", "'WGS 84' is geocentric"),
     ):
         columns = mapping(**FULL, crs=crs)
         read_it = partial(user_table.read, path, columns, "scenario.toml: traffic.track_columns")

@@ -42,7 +42,7 @@ READERS = (
         "building footprints",
         "map",
         "egvs.extensions.maps.buildings.footprint_maps",
-        suffixes=(".geojson", ".gpkg", ".shp", ".kml", ".parquet", ".geoparquet"),
+        suffixes=(".geojson", ".gpkg", ".shp", ".kml", ".kmz", ".parquet", ".geoparquet"),
         gives=("solids",),
     ),
     Reader(

@@ -155,6 +155,16 @@ def test_wrong_track_columns_are_reported(run_egvs, tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
+def test_two_statements_of_the_system_are_an_error(run_egvs, tmp_path: Path) -> None:
+    road_map, tracks = write_crossing(tmp_path / "map.osm"), write_tracks(tmp_path / "tracks.csv")
+    columns = tmp_path / "columns.toml"
+    columns.write_text('time = "t"\nid = "who"\nx = "x"\ny = "y"\ndefault_type = "car"\ncrs = "EPSG:25832"\n')
+    options = ["--tracks", tracks, "--track-columns", columns, "--track-crs", "world"]
+    code, _, err = run_egvs("new", tmp_path / "new", "--from", road_map, *options)
+    assert code == 2
+    assert "columns.toml: crs: states the system of the tracks already: 'EPSG:25832'. Leave out this key or" in err
+
+
 def test_track_crs_without_tracks_is_an_error(run_egvs, tmp_path: Path) -> None:
     road_map = write_crossing(tmp_path / "map.osm")
     code, _, err = run_egvs("new", tmp_path / "new", "--from", road_map, "--track-crs", "world")

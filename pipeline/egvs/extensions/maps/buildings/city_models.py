@@ -45,6 +45,7 @@ from egvs.extensions.maps.formats.city_objects import (
 )
 from egvs.extensions.maps.formats.gml import ReferenceSystem, parse_srs_name
 from egvs.extensions.maps.formats.surface_meshes import SurfaceMesh, triangulate_surfaces
+from egvs.formats.georeference import format_distance
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.world.map_features import LEVEL_M
 
@@ -159,7 +160,7 @@ class _Collector:
         where = f"{file.path}: {city_object.name}"
         system = systems.get(city_object.srs_name)
         if system is None:
-            system = systems[city_object.srs_name] = parse_srs_name(city_object.srs_name, where)
+            system = systems[city_object.srs_name] = self._reference_system(city_object.srs_name, where)
 
         selection = select_surfaces(city_object)
         self.repairs["unresolved"] += selection.unresolved
@@ -185,6 +186,10 @@ class _Collector:
             self._add_footprint(city_object, kind, rings_m, where)
         else:
             self._add_mesh(city_object, kind, rings_m, where)
+
+    def _reference_system(self, srs_name: str, where: str) -> ReferenceSystem:
+        crs = self.context.usable_crs(lambda: parse_srs_name(srs_name, where).crs, where)
+        return ReferenceSystem(None) if crs is None else parse_srs_name(srs_name, where)
 
     def _place(self, placement: Placement, file: CityModelFile, system: ReferenceSystem, where: str) -> Rings:
         """Return the surfaces of a template where it is placed."""
@@ -327,8 +332,8 @@ class _OutsideObjects:
             hint = f"Correct the order of the coordinates, or name a system whose axes are {order}."
             raise InputError(self._where, problem, hint)
         yield (
-            f"{Path(self._where).name}: none of its {number_of(self._outside, 'object')} is within reach; the"
-            " nearest is" + (f" {self._nearest_m / 1000:,.1f} km away.")
+            f"{Path(self._where).name}: none of its {number_of(self._outside, 'object')} is within reach of the"
+            f" sensors; the nearest is {format_distance(math.ceil(self._nearest_m))} beyond it."
         )
 
     def _is_inside_swapped(self, point: FloatArray, system: ReferenceSystem) -> bool:
@@ -365,7 +370,9 @@ def _to_world(placed: _Placed, context: MapContext, where: str) -> Rings:
     """Return rings with x and y in the world frame."""
     rings = [ring for surface in placed.rings for ring in surface]
     points = np.concatenate(rings)
-    points_m = np.column_stack([context.to_world(points[:, :2], placed.system.crs, where), points[:, 2]])
+    xy_m = context.to_world(points[:, :2], placed.system.crs, where)
+    unit_m = context.height_unit(None, where).metres if placed.system.crs is None else 1.0  # else metres already
+    points_m = np.column_stack([xy_m, points[:, 2] * unit_m])
     _check_coordinates(points_m, where)
     pieces = iter(np.split(points_m, np.cumsum([len(ring) for ring in rings])[:-1]))
     return [[next(pieces) for _ in surface] for surface in placed.rings]

@@ -6,6 +6,7 @@ reaches are opened, and only those with kinds of objects that are modelled.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import shapely
 
-from egvs.core import limits
+from egvs.core import limits, readers
 from egvs.creation.map_parts import MapContext, SolidMap
 from egvs.extensions.maps.buildings.city_models import SOLID_KINDS, collect_solids
 from egvs.extensions.maps.formats import citygml
@@ -23,15 +24,27 @@ from egvs.extensions.maps.formats.mesh_codes import TileName, parse_tile_name
 TILE_KINDS = frozenset({"bldg", "brid", "cons", "frn", "veg"})
 """Kinds of PLATEAU's tiles with solids, in the names of files."""
 
+_FIRST_MEMBER = rb"<(?:[\w.-]+:)?(?:cityObjectMember|featureMember|member)\b[^>]{0,80}>\s{0,80}<(?:[\w.-]+:)?[A-Za-z]+"
+
 TILE_MARGIN_M = 200.0
 """How far objects may reach beyond the square of their tile."""
 
 
 def is_relief(path: Path, head: bytes) -> bool:
-    """Return whether a file is terrain (:mod:`egvs.extensions.maps.terrain.citygml_relief`), by its name or its
-    beginning."""
+    """Return whether a file is terrain (:mod:`egvs.extensions.maps.terrain.citygml_relief`), by its name, its
+    beginning, or its first member."""
+    if not citygml.is_citygml(head):
+        return False
+    if citygml.has_relief(head):
+        return True
     tile = parse_tile_name(path.name)
-    return citygml.has_relief(head) or (citygml.is_citygml(head) and tile is not None and tile.kind == "dem")
+    if tile is not None:
+        return tile.kind == "dem"
+    try:
+        member = readers.first_match(path, _FIRST_MEMBER)
+    except (EOFError, OSError, zlib.error):  # damaged: its reader says so
+        return False
+    return member is not None and member.endswith(b"ReliefFeature")
 
 
 def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:

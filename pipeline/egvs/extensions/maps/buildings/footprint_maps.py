@@ -51,7 +51,7 @@ def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
 
 
 def _read_file(path: Path, context: MapContext, counts: ImportCounts) -> Iterator[MappedSolid]:
-    features, crs = _read_features(path)
+    features, crs = _read_features(path, context)
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
         if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
@@ -70,7 +70,7 @@ def _read_file(path: Path, context: MapContext, counts: ImportCounts) -> Iterato
             yield solid
 
 
-def _read_features(path: Path) -> tuple[list[Any], str | None]:
+def _read_features(path: Path, context: MapContext) -> tuple[list[Any], str | None]:
     """Return the features of a file, and their reference system; None for local metres."""
     if vector_files.is_gis_file(path):
         document = vector_files.read_gis_file(path, "Polygon")
@@ -78,8 +78,12 @@ def _read_features(path: Path) -> tuple[list[Any], str | None]:
         document = read_json(path, _HINT)
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, "expected a GeoJSON FeatureCollection, got no features list", _HINT)
-    crs = declared_crs(document, str(path)) if "crs" in document else WGS84
-    return document["features"], None if crs == WORLD else crs
+
+    def read_crs() -> str | None:
+        crs = declared_crs(document, str(path)) if "crs" in document else WGS84
+        return None if crs == WORLD else crs
+
+    return document["features"], context.usable_crs(read_crs, str(path))
 
 
 def _read_area(

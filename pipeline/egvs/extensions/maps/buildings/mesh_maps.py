@@ -59,11 +59,12 @@ def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
 
 
 def _to_world(mesh: trimesh.Trimesh, path: Path, context: MapContext) -> FloatArray:
-    """Return the vertices (n, 3): x and y in the world frame, z as in the file."""
+    """Return the vertices (n, 3): x and y in the world frame, z as in the file, in metres."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     if path.suffix.lower() in _Y_UP:
         vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
-    return np.column_stack([context.to_world(vertices[:, :2], None, str(path)), vertices[:, 2]])
+    xy_m = context.to_world(vertices[:, :2], None, str(path))
+    return np.column_stack([xy_m, vertices[:, 2] * context.height_unit(None, str(path)).metres])
 
 
 def _pieces(

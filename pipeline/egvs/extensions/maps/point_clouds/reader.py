@@ -1,7 +1,7 @@
 """Read as-built point clouds as the static world: PCD, PLY, LAS, LAZ, E57 and CSV, also gzipped.
 
-Steps of :func:`read_solids`: read the points in chunks; drop those that are not finite; convert the others to the world
-frame; drop those outside the window; thin large scans; drop what moved
+Steps of :func:`read_solids`: read the points in chunks; drop those that the file marks as errors and those that are not
+finite; convert the others to the world frame; drop those outside the window; thin large scans; drop what moved
 (:mod:`egvs.extensions.maps.point_clouds.moving_points`); triangulate the rest
 (:mod:`egvs.extensions.maps.point_clouds.surface`).
 All drops are counted.
@@ -9,7 +9,8 @@ All drops are counted.
 Where the scanner stood is known from the poses of E57 scans and the VIEWPOINT of PCD files. Without it, moving objects
 cannot be told from static ones, and the space that no beam crossed from free space.
 
-Heights stay those of the file, in metres.
+Heights stay those of the file, converted to metres. A file whose reference system cannot be used is placed by an
+alignment, if there is one.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +31,14 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
 from egvs.core.wording import number_of
-from egvs.creation.map_parts import GROUND_KIND, OBJECT_KIND, OUT_OF_RANGE, ImportCounts, MapContext, MappedMesh
+from egvs.creation.map_parts import (
+    GROUND_KIND,
+    OBJECT_KIND,
+    OUT_OF_RANGE,
+    ImportCounts,
+    MapContext,
+    MappedMesh,
+)
 from egvs.creation.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.extensions.maps.buildings.mesh_maps import has_faces
 from egvs.extensions.maps.point_clouds.as_built_view import AsBuiltMap
@@ -42,7 +51,7 @@ from egvs.extensions.maps.point_clouds.moving_points import (
 )
 from egvs.extensions.maps.point_clouds.surface import CloudSurface, TriangleSurface, thin_points, triangulate_cloud
 from egvs.formats import point_clouds, xml
-from egvs.formats.georeference import height_unit_m
+from egvs.formats.georeference import HeightUnit, format_distance
 from egvs.scenario.fields import MAX_COORDINATE_M
 
 THIN_CELL_M = 0.075
@@ -51,7 +60,7 @@ THIN_CELL_M = 0.075
 LARGE_SCAN = 1_000_000
 """Scans with more points in the window are large."""
 
-NOT_FINITE, MOVING, THINNED = "not_finite", "moving", "thinned"
+NOT_FINITE, MARKED, MOVING, THINNED = "not_finite", "marked", "moving", "thinned"
 """Reasons to leave out points, beside ``out_of_range``."""
 
 _SUFFIXES = ("csv", "e57", "las", "laz", "pcd", "ply")
@@ -148,6 +157,8 @@ class _Survey:
     counts: ImportCounts = field(default_factory=ImportCounts)
     points_read: int = 0
     kept: int = 0
+    marked: Counter[str] = field(default_factory=Counter)
+    units: dict[str, None] = field(default_factory=dict)
 
     def drop(self, reason: str, points: int) -> None:
         if points:
@@ -165,15 +176,21 @@ def _read_file(survey: _Survey, path: Path, context: MapContext) -> None:
         where = str(path)
         crs: str | None = None
         scans: dict[int, _Scan] = {}
+        nearest_m = np.inf
         for number, chunk in enumerate(point_clouds.stream_points(plain, where)):
             if number == 0:
-                crs = point_clouds.point_cloud_crs(plain, where)
+                crs = context.usable_crs(partial(point_clouds.point_cloud_crs, plain, where), where)
+                survey.units.setdefault(_unit_note(context.height_unit(crs, where)))
             if chunk.scan not in scans:
                 scans[chunk.scan] = _Scan(_station(chunk.station_m, crs, context, where))
             survey.points_read += len(chunk.points_m)
+            survey.marked.update(chunk.marked)
             finite = chunk.points_m[np.isfinite(chunk.points_m).all(axis=1)]
-            survey.drop(NOT_FINITE, len(chunk.points_m) - len(finite))
-            inside = _in_window(_to_world(finite, crs, context, where), context)
+            survey.drop(MARKED, sum(chunk.marked.values()))
+            survey.drop(NOT_FINITE, len(chunk.points_m) - len(finite) - sum(chunk.marked.values()))
+            points_m = _to_world(finite, crs, context, where)
+            nearest_m = min(nearest_m, _distance_m(points_m, context))
+            inside = _in_window(points_m, context)
             survey.drop(OUT_OF_RANGE, len(finite) - len(inside))
             merged = scans[chunk.scan].add(inside)
             survey.drop(THINNED, merged)
@@ -182,9 +199,15 @@ def _read_file(survey: _Survey, path: Path, context: MapContext) -> None:
     if survey.kept == kept_before:
         problem = (
             f"none of its {number_of(survey.points_read - points_before, 'point')} is in the window around the roads"
+            f" ({format_distance(nearest_m)} from it)"
         )
         raise InputError(where, problem, "Check its coordinate reference system, or its --align.")
     survey.scans += scans.values()
+
+
+def _unit_note(unit: HeightUnit) -> str:
+    name = "metres" if unit.metres == 1.0 else f"{unit.name.replace('foot', 'feet')} and converted to metres"
+    return f"Heights in the file are in {name} ({unit.source})."
 
 
 def _suffix(path: Path) -> str:
@@ -216,7 +239,7 @@ def _to_world(points: FloatArray, crs: str | None, context: MapContext, where: s
     if farthest > MAX_COORDINATE_M:
         problem = f"expected coordinates of at most {MAX_COORDINATE_M:g}, got {farthest:g}"
         raise InputError(where, problem, COMPLETE_FILE)
-    unit_m = 1.0 if crs is None else height_unit_m(crs, where)
+    unit_m = context.height_unit(crs, where).metres
     return np.column_stack([context.to_world(points[:, :2], crs, where), points[:, 2] * unit_m])
 
 
@@ -225,6 +248,14 @@ def _station(station: FloatArray | None, crs: str | None, context: MapContext, w
         return None
     station_m: FloatArray = _to_world(station[None, :], crs, context, where)[0]
     return station_m
+
+
+def _distance_m(points_m: FloatArray, context: MapContext) -> float:
+    """Return the distance from the window to the rectangle around points (n, 3); inf without points."""
+    if not len(points_m):
+        return np.inf
+    around = shapely.box(*points_m[:, :2].min(axis=0), *points_m[:, :2].max(axis=0))
+    return float(context.window.distance(around))
 
 
 def _in_window(points_m: FloatArray, context: MapContext) -> FloatArray:
@@ -269,10 +300,11 @@ def _mesh(kind: str, triangles: TriangleSurface) -> MappedMesh:
 
 def _notes(survey: _Survey, surface: CloudSurface, points: int) -> tuple[str, ...]:
     """Return sentences about the points, the stations and what follows from them."""
+    marked = "".join(f" {count:,} marked as {mark}," for mark, count in sorted(survey.marked.items()))
     read = (
         f"{survey.points_read:,} points read from {number_of(len(survey.scans), 'scan')}:"
-        f" {survey.dropped(OUT_OF_RANGE):,}"
-        f" outside the window, {survey.dropped(NOT_FINITE):,} not finite, {survey.dropped(MOVING):,} on moving objects,"
+        f" {survey.dropped(OUT_OF_RANGE):,} outside the window, {survey.dropped(NOT_FINITE):,} not finite,{marked}"
+        f" {survey.dropped(MOVING):,} on moving objects,"
         f" {survey.dropped(THINNED):,} merged with neighbours within {THIN_CELL_M:g} m; {points:,} are used"
         f" ({surface.ground_points:,} on the ground)."
     )
@@ -280,7 +312,7 @@ def _notes(survey: _Survey, surface: CloudSurface, points: int) -> tuple[str, ..
         f"The as-built surface has {len(surface.ground.faces):,} triangles of ground and"
         f" {len(surface.objects.faces):,} of everything else, all open: no site can be inside of an object."
     )
-    return (read, made, _station_note(survey))
+    return (read, made, _station_note(survey), *survey.units)
 
 
 def _station_note(survey: _Survey) -> str:

@@ -49,10 +49,8 @@ class _Sweep(NamedTuple):
 
 
 def can_open(_path: Path, head: bytes) -> bool:
-    """Return whether a JSON list is empty, or begins with a label or an entry of ``data_info.json``."""
-    text = head.removeprefix(b"\xef\xbb\xbf").strip()
-    is_empty = text[:1] + text[1:].lstrip() == b"[]"
-    return is_empty or (text.startswith(b"[") and (b'"3d_location"' in head or b'"label_lidar_std_path"' in head))
+    """Return whether a file with a member of a label, or of an entry of ``data_info.json``, is a JSON list."""
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"[")
 
 
 def companions(path: Path) -> Sequence[Path]:

@@ -59,8 +59,8 @@ _STATIC = frozenset({
 
 
 def can_open(_path: Path, head: bytes) -> bool:
-    """Return whether a JSON object begins with OpenLABEL's root."""
-    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{") and b'"openlabel"' in head
+    """Return whether a file with the name of OpenLABEL's root is a JSON object."""
+    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
 
 
 def companions(path: Path) -> Sequence[Path]:

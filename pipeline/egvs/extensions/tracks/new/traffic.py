@@ -161,6 +161,9 @@ def _find_tracks(paths: Sequence[Path], options: RecordingOptions) -> TrackFiles
     if not paths:
         return None
     columns = None if options.columns is None else files.read_track_columns(options.columns)
+    if options.crs is not None and columns is not None and columns.crs is not None:
+        problem = f"states the system of the tracks already: {columns.crs!r}"
+        raise InputError(f"{options.columns}: crs", problem, "Leave out this key or --track-crs.")
     return TrackFiles.find(paths, options.crs, columns)
 
 

@@ -1,0 +1,149 @@
+"""Unpack ZIP archives of map files, such as zipped Shapefiles and tiles, and KMZ files.
+
+Another process (:mod:`egvs.formats.reader_process`) unpacks the members; this one writes them to a temporary folder
+that is named like the archive. Members whose names lead out of it, links and encrypted members are errors; archives
+inside of archives stay packed. Messages name the archive and the member, never the temporary folder.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import zipfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path, PurePosixPath
+
+from egvs.core import files, limits
+from egvs.core.errors import InputError
+from egvs.core.reading import COMPLETE_FILE, name_in_errors
+from egvs.formats.reader_process import Block, read_blocks, serve
+
+SUFFIX = ".zip"
+"""Files with this ending stand for the files in them, as folders do."""
+
+MAX_MEMBERS = 10_000
+"""Largest number of files in an archive."""
+
+_CHUNK_BYTES = 1 << 20
+_CANNOT_READ = "cannot be read as a ZIP archive"
+_UNPACK_HINT = "Unpack it, and give the file or the folder."
+_IGNORED = ("__MACOSX", "Thumbs.db")
+
+
+class UnpackedFiles:
+    """Files and folders, archives among them unpacked.
+
+    Attributes
+    ----------
+    paths
+        In the order given; a folder for each archive.
+    """
+
+    def __init__(self) -> None:
+        self.paths: list[Path] = []
+        self._originals: dict[str, str] = {}
+
+    def add(self, archive: Path, folder: Path) -> None:
+        """Add an archive that was unpacked to a folder."""
+        self.paths.append(folder)
+        self._originals[os.fspath(folder)] = os.fspath(archive)
+
+    def user_text(self, text: str) -> str:
+        """Return a text with the names of the archives instead of the folders."""
+        for folder, archive in self._originals.items():
+            text = text.replace(folder, archive)
+        return text
+
+
+@contextmanager
+def unpack_archives(paths: Sequence[Path], suffixes: Sequence[str] = (SUFFIX,)) -> Iterator[UnpackedFiles]:
+    """Yield files with a folder for each archive among them, and let errors in the block name the archive.
+
+    Parameters
+    ----------
+    paths
+        Files and folders.
+    suffixes
+        Endings of the names of archives; other files stay as they are.
+
+    Raises
+    ------
+    InputError
+        When an archive is damaged or encrypted, has members that lead out of it, or too many or too large ones.
+    """
+    unpacked = UnpackedFiles()
+    with ExitStack() as stack:
+        for path in paths:
+            if path.suffix.lower() not in suffixes or not path.is_file():
+                unpacked.paths.append(path)
+                continue
+            folder = stack.enter_context(files.temporary_folder()) / path.name
+            folder.mkdir()
+            _unpack(path, folder)
+            unpacked.add(path, folder)
+        with name_in_errors(unpacked.user_text):
+            yield unpacked
+
+
+def _unpack(path: Path, folder: Path) -> None:
+    """Write the members of an archive to a folder."""
+    limits.checked_size(path, limits.FILE)
+    size = 0
+    for block in read_blocks(__name__, path, os.fspath(path), _CANNOT_READ):
+        target = folder.joinpath(*_parts(block.values["name"], path))
+        size += len(block.content)
+        limits.UNPACKED.check_bytes(path, size)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with target.open("ab") as file:
+            file.write(block.content)
+
+
+def _parts(name: str, path: Path) -> tuple[str, ...]:
+    """Return the parts of a member's path inside its archive; InputError when it leads out of it."""
+    parts = PurePosixPath(name).parts
+    if not parts or ".." in parts or name.startswith("/") or any(mark in name for mark in "\\:\0"):
+        problem = f"its member {name[:80]!r} leads out of the archive"
+        raise InputError(path, problem, "Make the archive again, with relative paths.")
+    return parts
+
+
+# --- in the other process ---
+
+
+def _read_file(path: Path) -> Iterator[Block]:
+    """Yield the content of each file in chunks."""
+    with zipfile.ZipFile(path) as archive:
+        members = [member for member in archive.infolist() if not member.is_dir()]
+        if len(members) > MAX_MEMBERS:
+            problem = f"has {len(members):,} files; at most {MAX_MEMBERS:,} are read"
+            raise InputError(path, problem, "Make an archive of the files around the junction.")
+        declared = sum(member.file_size for member in members)
+        limits.UNPACKED.check_bytes(path, declared, f"has {declared / limits.MB:,.0f} MB after decompression")
+        for member in members:
+            if member.flag_bits & 1:
+                raise InputError(path, f"its member {member.filename[:80]!r} is encrypted", _UNPACK_HINT)
+            if stat.S_ISLNK(member.external_attr >> 16):
+                raise InputError(path, f"its member {member.filename[:80]!r} is a link", _UNPACK_HINT)
+            parts = _parts(member.filename, path)
+            if parts[0] not in _IGNORED and not parts[-1].startswith("."):
+                yield from _read_member(archive, member)
+
+
+def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Iterator[Block]:
+    values = {"name": member.filename}
+    yield Block(values)
+    try:
+        with archive.open(member) as content:
+            while chunk := content.read(_CHUNK_BYTES):
+                yield Block(values, chunk)
+    except NotImplementedError as error:
+        problem = f"its member {member.filename[:80]!r} cannot be unpacked ({error})"
+        raise InputError(archive.filename, problem, _UNPACK_HINT) from None
+    except (zipfile.BadZipFile, EOFError) as error:
+        problem = f"its member {member.filename[:80]!r} is damaged ({error})"
+        raise InputError(archive.filename, problem, COMPLETE_FILE) from None
+
+
+if __name__ == "__main__":
+    serve(_read_file)
