@@ -101,15 +101,15 @@ def compare_turns(permitted: Set[Turn], built: Set[Turn], tolerated: Collection[
     built
         Turns of the network.
     tolerated
-        Turns that the network may have or lack.
+        Further turns that the network may have.
 
     Returns
     -------
     TurnComparison
         Empty where both agree.
     """
-    ignored = set(tolerated)
-    return TurnComparison(tuple(sorted(permitted - built - ignored)), tuple(sorted(built - permitted - ignored)))
+    lost, added = permitted - built, built - permitted - set(tolerated)
+    return TurnComparison(tuple(sorted(lost)), tuple(sorted(added)))
 
 
 def patch_network(
@@ -183,17 +183,16 @@ def turn_notes(
         What still differs: turns that only the map has, and turns that only the network has.
     """
     rows = (
-        (closed, "not in the map", "that netconvert had added", ("was", "were"), " closed"),
-        (opened, "of the map", "that netconvert had lost", ("was", "were"), " added"),
-        (lost, "of the map", "", ("is", "are"), " missing in the network"),
-        (added, "of the network", "", ("is", "are"), " not in the map"),
+        (closed, "that the map does not permit", ("was", "were"), "closed"),
+        (opened, "of the map that netconvert had left out", ("was", "were"), "added"),
+        (lost, "of the map", ("is", "are"), "missing in the network"),
+        (added, "of the network", ("is", "are"), "not permitted by the map"),
     )
     notes = []
-    for names, whose, why, verbs, what in rows:
+    for names, which, verbs, what in rows:
         if names:
-            count = len(names)
-            subject = " ".join(part for part in (number_of(count, "turn"), whose, why) if part)
-            notes.append(f"{subject} {by_number(count, *verbs)}{what}: {list_turns(names)}.")
+            verb = by_number(len(names), *verbs)
+            notes.append(f"{number_of(len(names), 'turn')} {which} {verb} {what}: {list_turns(names)}.")
     return tuple(notes)
 
 

@@ -140,7 +140,7 @@ def read_solids(folder: Path) -> dict[str, dict]:
 
 def test_nearby_streets_give_same_poles_as_all_streets(extract: Path) -> None:
     read = osm.read_osm(extract)
-    _, streets = street_network.build_network(
+    _, streets, _ = street_network.build_network(
         read, extract, street_network.netconvert_flags(read, lefthand=False, walk=True)
     )
     for junction in streets.junctions:
@@ -152,7 +152,7 @@ def test_nearby_streets_give_same_poles_as_all_streets(extract: Path) -> None:
 
 def test_network_excerpt_keeps_streets(extract: Path, tmp_path: Path) -> None:
     read = osm.read_osm(extract)
-    text, streets = street_network.build_network(
+    text, streets, _ = street_network.build_network(
         read, extract, street_network.netconvert_flags(read, lefthand=False, walk=True)
     )
     excerpts, complete = network_excerpts.NetworkExcerpts(text), streets.network

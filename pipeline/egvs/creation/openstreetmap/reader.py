@@ -57,6 +57,8 @@ class OsmRoads:
         The network, as text and read.
     others
         Ways on other levels than the junction.
+    map_notes, turn_notes
+        Sentences for the user about the map, and about the turns of the network.
     """
 
     extract: OsmExtract
@@ -66,7 +68,8 @@ class OsmRoads:
     streets: Streets
     others: OtherLevels = _ONE_LEVEL
     attribution: str = ATTRIBUTION
-    notes: tuple[str, ...] = ()
+    map_notes: tuple[str, ...] = ()
+    turn_notes: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, path: Path, options: RoadOptions) -> OsmRoads:
@@ -97,8 +100,13 @@ class OsmRoads:
             if elevations.heights_m:
                 extract = elevation.add_elevations(extract, elevations.heights_m)
                 flags += elevation.ELEVATION_FLAGS
-        network, streets = osm_network.build_network(extract, path, flags)
-        return cls(extract, path, tuple(flags), network, streets, notes=notes)
+        network, streets, turn_notes = osm_network.build_network(extract, path, flags)
+        return cls(extract, path, tuple(flags), network, streets, map_notes=notes, turn_notes=turn_notes)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user about the map, and about the turns of the network."""
+        return (*self.map_notes, *self.turn_notes)
 
     @property
     def keeps_heights(self) -> bool:
@@ -120,18 +128,18 @@ class OsmRoads:
         if not others.roads:
             return replace(self, others=others)
         extract = osm_network.cut_out_roads(self.extract, self.streets, others.roads, window)
-        network, streets = osm_network.build_network(extract, self.path, self.flags)
-        return replace(self, extract=extract, network=network, streets=streets, others=others)
+        network, streets, notes = osm_network.build_network(extract, self.path, self.flags)
+        return replace(self, extract=extract, network=network, streets=streets, others=others, turn_notes=notes)
 
     def around(self, junction: StreetJunction, radius_m: float | None) -> OsmRoads:
         """Return the roads within a radius of a junction, in the same frame; :data:`SURROUNDINGS_M` if it is None."""
         radius_m = SURROUNDINGS_M if radius_m is None else radius_m
         if math.isinf(radius_m):
             return self
-        network, streets = osm_network.crop_network(
+        network, streets, notes = osm_network.crop_network(
             self.extract, self.path, self.flags, self.streets, junction, radius_m
         )  # fmt: skip
-        return replace(self, network=network, streets=streets)
+        return replace(self, network=network, streets=streets, turn_notes=notes)
 
     def edge_levels(self) -> dict[str, int]:
         """Return the levels of the edges that are not on the ground: bridges and tunnels."""

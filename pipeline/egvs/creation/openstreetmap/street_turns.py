@@ -15,6 +15,7 @@ import re
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -65,6 +66,13 @@ _MOTORWAYS = ("motorway", "motorway_link")
 _CAR_KEYS = ("motorcar", "motor_vehicle", "vehicle", "access")
 _NO_ACCESS = ("no", "private", "agricultural", "forestry", "military")
 _BUS_KEYS = ("bus", "psv")
+
+_ARROWS_DEG = {
+    "through": (-60.0, 60.0), "merge_to_left": (-60.0, 60.0), "merge_to_right": (-60.0, 60.0),
+    "slight_left": (5.0, 110.0), "left": (20.0, 180.0), "sharp_left": (50.0, 180.0),
+    "slight_right": (-110.0, -5.0), "right": (-180.0, -20.0), "sharp_right": (-180.0, -50.0), "reverse": (150.0, 180.0),
+}  # fmt: skip
+"""Angles of the turns that an arrow on a lane can mean, positive to the left."""
 
 Pair = tuple[str, str]
 
@@ -132,15 +140,12 @@ class MapTurn:
         The pieces of ways between them.
     for_cars
         Whether cars may drive on all of them, in this direction.
-    relations
-        The restrictions that forbid it; empty if it is permitted.
     """
 
     source: str
     target: str
     inside: tuple[Step, ...]
     for_cars: bool
-    relations: frozenset[int]
 
 
 class StreetGraph:
@@ -231,8 +236,8 @@ class StreetGraph:
     def _walk(self, step: Step, end: int, ways: Collection[int]) -> tuple[Step, ...]:
         """Follow the ways of an edge from its first step to its last node; empty if that is not reached."""
         steps: list[Step] = []
-        seen_ways = {step.way}
-        while True:
+        rest = {*ways} - {step.way}
+        while len(steps) <= sum(len(self._ways[way].nodes) for way in ways if way in self._ways):
             nodes = self._ways[step.way].nodes
             following = step.index + (1 if step.forward else -1)
             if 0 <= following < len(nodes):
@@ -240,12 +245,15 @@ class StreetGraph:
                 if nodes[following] == end:
                     return tuple(steps)
                 step = Step(step.way, following, step.forward)
-                continue
-            next_step = self._continue(nodes[step.index], [way for way in ways if way not in seen_ways])
-            if next_step is None:
-                return ()
-            seen_ways.add(next_step.way)
-            step = next_step
+            elif nodes[0] == nodes[-1]:
+                step = Step(step.way, 0 if step.forward else len(nodes) - 1, step.forward)
+            else:
+                next_step = self._continue(nodes[step.index], rest)
+                if next_step is None:
+                    return ()
+                rest.remove(next_step.way)
+                step = next_step
+        return ()
 
     def _continue(self, node: int, ways: Collection[int]) -> Step | None:
         """Return the start of a further way of an edge at the node where the one before ends."""
@@ -268,7 +276,7 @@ class StreetGraph:
     def turns_from(self, edge: StreetEdge, rules: TurnRules) -> Iterator[MapTurn]:
         """Yield the turns that a map permits from an edge."""
         progress = Progress()
-        for before, after in zip(edge.steps, edge.steps[1:], strict=False):
+        for before, after in pairwise(edge.steps):
             progress, _ = rules.follow(before, after, self.end_node(before), progress)
         queue = deque([(edge.steps[-1], progress, (), True)])
         seen = {(edge.steps[-1], progress, True)}
@@ -282,7 +290,7 @@ class StreetGraph:
                 target = self._edge_of_first.get(after)
                 if target is not None:
                     if self.edges[target].from_node == edge.to_node:
-                        yield MapTurn(edge.id, target, inside, for_cars, frozenset())
+                        yield MapTurn(edge.id, target, inside, for_cars)
                     continue
                 if after in self._on_edges or after == step.reverse:
                     continue
@@ -292,18 +300,18 @@ class StreetGraph:
                     seen.add(state)
                     queue.append((state[0], state[1], path, state[2]))
 
-    def turn(self, source: str, target: str) -> MapTurn | None:
-        """Return a turn as the ways lead, with the restrictions that forbid it; None if no way leads there."""
+    def forbidding(self, source: str, target: str) -> frozenset[int]:
+        """Return the restrictions that forbid a turn; empty if no way leads there."""
         ways_only = TurnRules((), self._ways)
         for turn in self.turns_from(self.edges[source], ways_only):
             if turn.target == target:
                 steps = (*self.edges[source].steps, *turn.inside, self.edges[target].steps[0])
                 progress, relations = Progress(), set()
-                for before, after in zip(steps, steps[1:], strict=False):
+                for before, after in pairwise(steps):
                     progress, forbidding = self.rules.follow(before, after, self.end_node(before), progress)
                     relations |= forbidding
-                return MapTurn(source, target, turn.inside, turn.for_cars, frozenset(relations))
-        return None
+                return frozenset(relations)
+        return frozenset()
 
     def _is_for_cars(self, step: Step) -> bool:
         tags = self._ways[step.way].tags
@@ -320,19 +328,27 @@ class StreetGraph:
             math.dist(self._xy(self.start_node(step)), self._xy(self.end_node(step))) for step in steps
         )  # fmt: skip
 
-    def turned_deg(self, source: str, target: str) -> float:
-        """Return the angle of a turn, -180 to 180, positive to the left."""
+    def turned_deg(self, source: str, target: str, inside: Sequence[Step] = ()) -> float:
+        """Return the angle of a turn over some pieces of ways, positive to the left; beyond 180 for a circle."""
         before = [self._xy(self.end_node(step)) for step in reversed(self.edges[source].steps)]
         before.append(self._xy(self.start_node(self.edges[source].steps[0])))
         after = [self._xy(self.start_node(step)) for step in self.edges[target].steps]
         after.append(self._xy(self.end_node(self.edges[target].steps[-1])))
-        turned = _bearing_deg(after) - (_bearing_deg(before) + 180.0)
-        return (turned + 180.0) % 360.0 - 180.0
+        pieces = [[self._xy(self.start_node(step)), self._xy(self.end_node(step))] for step in inside]
+        bearings = [_bearing_deg(before) + 180.0, *map(_bearing_deg, pieces), _bearing_deg(after)]
+        return math.fsum(_wrap_deg(after - before) for before, after in pairwise(bearings))
 
-    def goes_back(self, source: str, target: str) -> bool:
+    def goes_back(self, turn: MapTurn) -> bool:
         """Return whether a turn leads back."""
-        is_reverse = self.edges[source].steps[-1].reverse == self.edges[target].steps[0]
-        return is_reverse or abs(self.turned_deg(source, target)) > U_TURN_DEG
+        is_back = abs(self.turned_deg(turn.source, turn.target, turn.inside)) > U_TURN_DEG
+        return is_back or self.is_same_street(turn.source, turn.target)
+
+    def follows_arrows(self, turn: MapTurn) -> bool:
+        """Return whether a lane has an arrow for a turn, or some lane has none."""
+        step = self.edges[turn.source].steps[-1]
+        arrows = _arrows(self._ways[step.way].tags, forward=step.forward)
+        turned_deg = _wrap_deg(self.turned_deg(turn.source, turn.target))
+        return not arrows or any(low <= turned_deg <= high for low, high in map(_ARROWS_DEG.__getitem__, arrows))
 
     def is_same_street(self, source: str, target: str) -> bool:
         """Return whether a turn leads back along the way that it comes from."""
@@ -371,6 +387,20 @@ def replace_nodes(way: Way, extract: OsmExtract) -> Way:
     return Way(way.id, tuple(node for node in way.nodes if node in extract.nodes), way.tags)
 
 
+def _arrows(tags: Tags, *, forward: bool) -> frozenset[str]:
+    """Return the arrows on the lanes of a way; empty if a lane has none, or an unknown one."""
+    keys = ["turn:lanes:forward" if forward else "turn:lanes:backward"]
+    if forward and directions(tags) == (True, False):
+        keys.append("turn:lanes")
+    text = next((tags[key] for key in keys if key in tags), "")
+    arrows = frozenset(arrow.strip() for lane in text.split("|") for arrow in lane.split(";"))
+    return arrows if arrows <= _ARROWS_DEG.keys() else frozenset()
+
+
+def _wrap_deg(angle_deg: float) -> float:
+    return (angle_deg + 180.0) % 360.0 - 180.0
+
+
 def _bearing_deg(points: Sequence[XY]) -> float:
     """Return the direction from the first point to the one some metres further, counter-clockwise from east."""
     start = points[0]
@@ -396,6 +426,8 @@ class StreetTurns:
         The restrictions that forbid an added turn, by turn.
     turns_back
         Permitted turns back to another street that the network lacks.
+    off_arrows
+        Turns of the network that no restriction forbids, but that no arrow on the lanes allows.
     """
 
     graph: StreetGraph
@@ -403,6 +435,7 @@ class StreetTurns:
     added: tuple[Pair, ...]
     relations: Mapping[Pair, frozenset[int]]
     turns_back: tuple[Pair, ...]
+    off_arrows: tuple[Pair, ...]
 
 
 def compare_with_map(extract: OsmExtract, network: Path) -> StreetTurns:
@@ -418,21 +451,25 @@ def compare_with_map(extract: OsmExtract, network: Path) -> StreetTurns:
     graph = StreetGraph(extract, network)
     for_cars: set[Pair] = set()
     for_any: set[Pair] = set()
+    forth: set[Pair] = set()
+    off_arrows: set[Pair] = set()
     for edge in graph.edges.values():
         for turn in graph.turns_from(edge, graph.rules):
             pair = turn.source, turn.target
             for_any.add(pair)
+            if not graph.goes_back(turn):
+                forth.add(pair)
+            if not graph.follows_arrows(turn):
+                off_arrows.add(pair)
             if turn.for_cars and edge.car_lanes and graph.edges[turn.target].car_lanes:
                 for_cars.add(pair)
     built = {pair for pair in graph.built.edge_pairs if pair[0] in graph.edges and pair[1] in graph.edges}
-    back = {pair for pair in for_any if graph.goes_back(*pair)}
-    comparison = compare_turns(for_cars, built, (for_any - for_cars) | back)
-    relations = {}
-    for pair in comparison.added:
-        turn_of_ways = graph.turn(*pair)
-        relations[pair] = frozenset() if turn_of_ways is None else turn_of_ways.relations
-    turns_back = sorted(pair for pair in (back & for_cars) - built if not graph.is_same_street(*pair))
-    return StreetTurns(graph, comparison.lost, comparison.added, relations, tuple(turns_back))
+    comparison = compare_turns(for_cars & forth - off_arrows, built, for_any)
+    relations = {pair: graph.forbidding(*pair) for pair in comparison.added}
+    back = [pair for pair in sorted(for_cars - forth - built) if not graph.is_same_street(*pair)]
+    return StreetTurns(
+        graph, comparison.lost, comparison.added, relations, tuple(back), tuple(sorted(off_arrows & forth & built))
+    )
 
 
 def repair_turns(
@@ -506,8 +543,13 @@ def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
     if after.turns_back:
         count = len(after.turns_back)
         yield (
-            f"{number_of(count, 'turn')} back to another carriageway {by_number(count, 'is', 'are')} left out, since"
-            f" vehicles that wait to turn back block a street: {list_turns(graph.title(p) for p in after.turns_back)}."
+            f"{number_of(count, 'U-turn')} to another carriageway {by_number(count, 'is', 'are')} left out, since vehicles"
+            f" that wait to turn back block a street: {list_turns(graph.title(pair) for pair in after.turns_back)}."
+        )
+    if after.off_arrows:
+        yield (
+            f"{number_of(len(after.off_arrows), 'turn')} of the network {by_number(len(after.off_arrows), 'has', 'have')}"
+            f" no arrow on the lanes of the map (turn:lanes): {list_turns(graph.title(pair) for pair in after.off_arrows)}."
         )
     yield from _restriction_notes(graph, graph.restrictions)
     if graph.unknown:
@@ -539,4 +581,6 @@ def _restriction_notes(graph: StreetGraph, restrictions: Restrictions) -> Iterat
 
 
 def _count(relations: Sequence[str]) -> str:
-    return f"{len(relations)} ({by_number(len(relations), 'relation', 'relations')} {list_first(relations, MOST_LISTED)})"
+    return (
+        f"{len(relations)} ({by_number(len(relations), 'relation', 'relations')} {list_first(relations, MOST_LISTED)})"
+    )

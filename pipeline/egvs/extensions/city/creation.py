@@ -235,7 +235,7 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     if around is not None:
         street_extract = osm_network.cut_surroundings(extract, around, rim_m)
     flags = osm_network.netconvert_flags(extract, lefthand=options.lefthand, walk=options.walk)
-    network, streets = osm_network.build_network(street_extract, osm, flags)
+    network, streets, turn_notes = osm_network.build_network(street_extract, osm, flags)
     within = None
     if around is not None:
         within = Point(streets.to_xy([around[1]], [around[0]])[0]).buffer(rim_m - RIM_WIDTH_M)
@@ -266,7 +266,7 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
         raise InputError(osm, f"no junction is left ({reasons})", hint)
 
     flow = CityFlow(find_flow(network, JUNCTION_BLOCKER_S), options.traffic)
-    notes = _import_notes(made, counts, flow, options.walk)
+    notes = (*turn_notes, *_import_notes(made, counts, flow, options.walk))
     city = NewCity(folder, tuple(made), left_out, streets, counts, flow, notes)
     scenario_files.publish_folder(folder, _city_files(city, name, network, solids, areas), _check_city)
     return city
