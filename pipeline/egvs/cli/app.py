@@ -611,7 +611,12 @@ def new(
             help="Overpass server for --download; default: EGVS_OVERPASS_URL, or overpass-api.de.",
         ),
     ] = None,
-    lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
+    lefthand: Annotated[
+        bool | None,
+        typer.Option(
+            "--lefthand/--righthand", help="The side on which traffic drives; by default, that of the map or country."
+        ),
+    ] = None,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
     surroundings: Annotated[
         str | None,

@@ -176,7 +176,7 @@ class RoadOptions:
     Attributes
     ----------
     lefthand
-        Whether traffic drives on the left.
+        Whether traffic drives on the left; None where the map and its position decide.
     walk
         Whether the network gets sidewalks and crossings.
     has_terrain
@@ -187,7 +187,7 @@ class RoadOptions:
         None if any will do. A reader may reject a position outside its map.
     """
 
-    lefthand: bool = False
+    lefthand: bool | None = None
     walk: bool = False
     has_terrain: bool = False
     at: tuple[float, float] | None = None

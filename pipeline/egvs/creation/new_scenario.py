@@ -223,7 +223,7 @@ class NewScenarioOptions:
     Attributes
     ----------
     lefthand
-        Whether traffic drives on the left.
+        Whether traffic drives on the left; by default, the map and its position decide.
     walk
         Whether the network gets sidewalks and crossings, which pedestrians need.
     surroundings_m
@@ -254,7 +254,7 @@ class NewScenarioOptions:
         CSV file with counts by street, side of arrival and turn, see :mod:`street_counts`; instead of assumed traffic.
     """
 
-    lefthand: bool = False
+    lefthand: bool | None = None
     walk: bool = False
     surroundings_m: float | None = None
     traffic: str | int = DEFAULT_TRAFFIC

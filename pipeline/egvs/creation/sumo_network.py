@@ -23,15 +23,15 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     path
         The network, gzipped or not.
     options
-        ``lefthand`` and ``walk`` must be off: both are fixed in a network.
+        ``lefthand`` and ``walk`` must not be set: both are fixed in a network.
 
     Raises
     ------
     InputError
         When the network is damaged, or an option is set.
     """
-    if options.lefthand or options.walk:
-        option = "--lefthand" if options.lefthand else "--walk"
+    if options.lefthand is not None or options.walk:
+        option = "--walk" if options.lefthand is None else "--lefthand" if options.lefthand else "--righthand"
         hint = "Leave it out, or make the network anew with netconvert."
         raise InputError(option, f"the SUMO network {path} has its own side of the road and sidewalks", hint)
     roads = network.read_net_xml(path)

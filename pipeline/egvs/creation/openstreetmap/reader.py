@@ -21,6 +21,7 @@ from egvs.creation.map_parts import ImportCounts, MapContext, MappedSolid, RoadO
 from egvs.creation.openstreetmap import ATTRIBUTION, elevation
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
+from egvs.creation.openstreetmap.side_evidence import choose_map_side, exceptions_note
 from egvs.creation.road_levels import OtherLevels
 from egvs.formats import osm as osm_files
 from egvs.formats.osm import OsmExtract
@@ -85,18 +86,20 @@ class OsmRoads:
         Raises
         ------
         InputError
-            When the file is damaged or has no drivable streets, or the position is outside.
+            When the file is damaged or has no drivable streets, the position is outside, or the side of traffic is
+            unclear.
         """
         extract = osm_files.read_osm(path)
         check_inside_extract(extract, options.at)
-        flags = osm_network.netconvert_flags(extract, lefthand=options.lefthand, walk=options.walk)
-        notes: tuple[str, ...] = ()
+        side = choose_map_side(extract, options.lefthand, options.at, str(path))
+        flags = osm_network.netconvert_flags(extract, lefthand=side.lefthand, walk=options.walk)
+        notes = side.note, *exceptions_note(extract, lefthand=side.lefthand)
         if options.has_terrain:
             flags += road_levels.keep_levels_flags(extract)
         else:
             elevations = elevation.read_elevations(extract)
             if elevations.note:
-                notes = (elevations.note,)
+                notes = *notes, elevations.note
             if elevations.heights_m:
                 extract = elevation.add_elevations(extract, elevations.heights_m)
                 flags += elevation.ELEVATION_FLAGS

@@ -24,16 +24,21 @@ _OLD_TIMES = ("day_on", "day_off", "hour_on", "hour_off", "date_on", "date_off")
 
 
 class Step(NamedTuple):
-    """The piece of a way between a node (``index``) and the next one, or the one before."""
+    """The piece of a way between the node at a position (``start``) and the next one, or the one before."""
 
     way: int
-    index: int
+    start: int
     forward: bool
+
+    @property
+    def end(self) -> int:
+        """Position of the node where it ends."""
+        return self.start + (1 if self.forward else -1)
 
     @property
     def reverse(self) -> Step:
         """The same piece, the other way."""
-        return Step(self.way, self.index + (1 if self.forward else -1), not self.forward)
+        return Step(self.way, self.end, not self.forward)
 
 
 @dataclass(frozen=True)

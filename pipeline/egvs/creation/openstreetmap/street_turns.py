@@ -63,6 +63,13 @@ _ONE_WAY = {"yes": (True, False), "true": (True, False), "1": (True, False), "-1
             "reverse": (False, True), "no": (True, True), "false": (True, True), "0": (True, True)}  # fmt: skip
 _RINGS = ("roundabout", "circular")
 _MOTORWAYS = ("motorway", "motorway_link")
+_FOR_CARS = frozenset({
+    *(f"{kind}{link}" for kind in ("motorway", "trunk", "primary", "secondary", "tertiary") for link in ("", "_link")),
+    "unclassified", "residential", "living_street", "service", "road",
+})  # fmt: skip
+_FOR_VEHICLES = _FOR_CARS | {"busway", "bus_guideway", "track", "raceway", "services"}
+"""Values of ``highway``."""
+
 _CAR_KEYS = ("motorcar", "motor_vehicle", "vehicle", "access")
 _NO_ACCESS = ("no", "private", "agricultural", "forestry", "military")
 _BUS_KEYS = ("bus", "psv")
@@ -104,7 +111,8 @@ def _bus_directions(tags: Tags) -> tuple[bool, bool]:
 
 
 def _admits_cars(tags: Tags) -> bool:
-    return next((tags[key] for key in _CAR_KEYS if key in tags), "") not in _NO_ACCESS
+    access = next((tags[key] for key in _CAR_KEYS if key in tags), "")
+    return tags.get("highway") in _FOR_CARS and access not in _NO_ACCESS
 
 
 @dataclass(frozen=True)
@@ -161,9 +169,7 @@ class StreetGraph:
 
     def __init__(self, extract: OsmExtract, network: Path) -> None:
         self._extract = extract
-        self._ways = {
-            way.id: replace_nodes(way, extract) for way in extract.ways.values() if "highway" in way.tags
-        }  # fmt: skip
+        self._ways = {way.id: _mapped(way, extract) for way in extract.ways.values() if "highway" in way.tags}
         self.restrictions = read_restrictions(extract)
         self.built = BuiltTurns()
         self.edges: dict[str, StreetEdge] = {}
@@ -175,6 +181,8 @@ class StreetGraph:
 
         self._leaving: dict[int, list[Step]] = {}
         for way in self._ways.values():
+            if way.tags["highway"] not in _FOR_VEHICLES:
+                continue
             along, against = _bus_directions(way.tags)
             for index in range(len(way.nodes)):
                 if along and index + 1 < len(way.nodes):
@@ -239,16 +247,15 @@ class StreetGraph:
         rest = {*ways} - {step.way}
         while len(steps) <= sum(len(self._ways[way].nodes) for way in ways if way in self._ways):
             nodes = self._ways[step.way].nodes
-            following = step.index + (1 if step.forward else -1)
-            if 0 <= following < len(nodes):
+            if 0 <= step.end < len(nodes):
                 steps.append(step)
-                if nodes[following] == end:
+                if nodes[step.end] == end:
                     return tuple(steps)
-                step = Step(step.way, following, step.forward)
+                step = Step(step.way, step.end, step.forward)
             elif nodes[0] == nodes[-1]:
                 step = Step(step.way, 0 if step.forward else len(nodes) - 1, step.forward)
             else:
-                next_step = self._continue(nodes[step.index], rest)
+                next_step = self._continue(nodes[step.start], rest)
                 if next_step is None:
                     return ()
                 rest.remove(next_step.way)
@@ -267,18 +274,18 @@ class StreetGraph:
 
     def start_node(self, step: Step) -> int:
         """Return the node where a step starts."""
-        return self._ways[step.way].nodes[step.index]
+        return self._ways[step.way].nodes[step.start]
 
     def end_node(self, step: Step) -> int:
         """Return the node where a step ends."""
-        return self.start_node(step.reverse)
+        return self._ways[step.way].nodes[step.end]
 
     def turns_from(self, edge: StreetEdge, rules: TurnRules) -> Iterator[MapTurn]:
         """Yield the turns that a map permits from an edge."""
         progress = Progress()
         for before, after in pairwise(edge.steps):
             progress, _ = rules.follow(before, after, self.end_node(before), progress)
-        queue = deque([(edge.steps[-1], progress, (), True)])
+        queue: deque[tuple[Step, Progress, tuple[Step, ...], bool]] = deque([(edge.steps[-1], progress, (), True)])
         seen = {(edge.steps[-1], progress, True)}
         while queue:
             step, progress, inside, for_cars = queue.popleft()
@@ -382,7 +389,7 @@ class StreetGraph:
         return tuple(relations)
 
 
-def replace_nodes(way: Way, extract: OsmExtract) -> Way:
+def _mapped(way: Way, extract: OsmExtract) -> Way:
     """Return a way without the nodes that the extract lacks."""
     return Way(way.id, tuple(node for node in way.nodes if node in extract.nodes), way.tags)
 
@@ -540,16 +547,17 @@ def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
         lost=[graph.title(pair) for pair in after.lost],
         added=[graph.title(pair, after.relations[pair]) for pair in after.added],
     )
-    if after.turns_back:
-        count = len(after.turns_back)
+    if count := len(after.turns_back):
+        turns = list_turns(graph.title(pair) for pair in after.turns_back)
         yield (
-            f"{number_of(count, 'U-turn')} to another carriageway {by_number(count, 'is', 'are')} left out, since vehicles"
-            f" that wait to turn back block a street: {list_turns(graph.title(pair) for pair in after.turns_back)}."
+            f"{number_of(count, 'U-turn')} to another carriageway {by_number(count, 'is', 'are')} left out, since"
+            f" vehicles that wait to turn back block a street: {turns}."
         )
-    if after.off_arrows:
+    if count := len(after.off_arrows):
+        turns = list_turns(graph.title(pair) for pair in after.off_arrows)
         yield (
-            f"{number_of(len(after.off_arrows), 'turn')} of the network {by_number(len(after.off_arrows), 'has', 'have')}"
-            f" no arrow on the lanes of the map (turn:lanes): {list_turns(graph.title(pair) for pair in after.off_arrows)}."
+            f"{number_of(count, 'turn')} of the network {by_number(count, 'has', 'have')} no arrow on the lanes of the"
+            f" map (turn:lanes): {turns}."
         )
     yield from _restriction_notes(graph, graph.restrictions)
     if graph.unknown:

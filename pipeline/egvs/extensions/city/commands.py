@@ -72,7 +72,12 @@ def new(
             metavar="WHICH", help="signalised, all, or a CSV table with the columns junction, lat_deg, lon_deg."
         ),
     ] = "signalised",
-    lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
+    lefthand: Annotated[
+        bool | None,
+        typer.Option(
+            "--lefthand/--righthand", help="The side on which traffic drives; by default, that of the map or country."
+        ),
+    ] = None,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
     traffic: Annotated[
         str,

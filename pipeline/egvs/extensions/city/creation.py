@@ -39,6 +39,7 @@ from egvs.creation.openstreetmap import ATTRIBUTION
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
 from egvs.creation.openstreetmap.reader import check_inside_extract
+from egvs.creation.openstreetmap.side_evidence import choose_map_side, exceptions_note
 from egvs.creation.plain_network import NETWORK_FILE
 from egvs.creation.scenario_files import PITCHES_DEG, SITES_FILE, STATICS_FILE, TomlTable, reachable_area
 from egvs.extensions.city import model
@@ -198,7 +199,7 @@ class NewCityOptions:
     around: tuple[float, float] | None = None
     radius_m: float | None = None
     which: str = SIGNALISED
-    lefthand: bool = False
+    lefthand: bool | None = None
     walk: bool = False
     traffic: str = DEFAULT_TRAFFIC
     progress: ProgressCallback = no_progress
@@ -220,7 +221,8 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     ------
     InputError
         When the folder is not empty, the file is damaged or has no drivable streets, ``around`` is outside the extract,
-        a table is wrong or selects junctions with overlapping regions, or no junction is left. Nothing is written then.
+        the side of traffic is unclear, a table is wrong or selects junctions with overlapping regions, or no junction
+        is left. Nothing is written then.
     """
     options = options or NewCityOptions()
     around, radius_m, which = options.around, options.radius_m, options.which
@@ -234,7 +236,8 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     street_extract, rim_m = extract, radius_m or DEFAULT_RADIUS_M
     if around is not None:
         street_extract = osm_network.cut_surroundings(extract, around, rim_m)
-    flags = osm_network.netconvert_flags(extract, lefthand=options.lefthand, walk=options.walk)
+    side = choose_map_side(extract, options.lefthand, around, str(osm))
+    flags = osm_network.netconvert_flags(extract, lefthand=side.lefthand, walk=options.walk)
     network, streets, turn_notes = osm_network.build_network(street_extract, osm, flags)
     within = None
     if around is not None:
@@ -266,7 +269,8 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
         raise InputError(osm, f"no junction is left ({reasons})", hint)
 
     flow = CityFlow(find_flow(network, JUNCTION_BLOCKER_S), options.traffic)
-    notes = (*turn_notes, *_import_notes(made, counts, flow, options.walk))
+    side_notes = side.note, *exceptions_note(extract, lefthand=side.lefthand)
+    notes = (*side_notes, *turn_notes, *_import_notes(made, counts, flow, options.walk))
     city = NewCity(folder, tuple(made), left_out, streets, counts, flow, notes)
     scenario_files.publish_folder(folder, _city_files(city, name, network, solids, areas), _check_city)
     return city

@@ -1,0 +1,201 @@
+"""On which side of the road traffic drives: what a map and its position tell, and what the user says.
+
+A reader of roads collects :class:`Evidence` in its map (rings of one-way streets, tags, lanes of opposite directions).
+:func:`side_at` adds the side of the country, and :func:`choose_side` decides, or stops where they contradict each
+other.
+
+The countries are ``left_hand_traffic.json``, made from the npm package @rapideditor/country-coder 5.6.1 (ISC licence)::
+
+    npm pack @rapideditor/country-coder@5.6.1 && tar xf rapideditor-country-coder-5.6.1.tgz
+    jq -c '.features[] | select(.properties.driveSide == "left")
+           | {type, properties: {name: .properties.nameEn}, geometry}' package/src/data/borders.json
+
+with these 106 features as rows of a FeatureCollection. Outlines are simplified: they run through the sea, and may be
+some hundred metres off on land (:data:`NEAR_BORDER_M`).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import shapely
+from shapely.geometry import Point
+from shapely.geometry.base import BaseGeometry
+
+from egvs.core.errors import InputError
+
+Side = Literal["left", "right"]
+
+COUNTRIES_FILE = Path(__file__).with_name("left_hand_traffic.json")
+
+NEAR_BORDER_M = 3000.0
+"""Nearer than this to countries where traffic drives on the other side, the position decides only where the map does
+not.
+"""
+
+ANONYMOUS_DEG = 0.5
+"""Maps nearer than this to latitude 0, longitude 0 (in the sea) hide where they are."""
+
+CLEAR_MAJORITY = 0.8
+
+_M_PER_DEG = 111_195.0
+
+
+class Evidence(NamedTuple):
+    """What tells the side of traffic.
+
+    Attributes
+    ----------
+    side
+        The side.
+    reason
+        Why, e.g. ``"the map lies in Japan"``.
+    is_strong
+        Whether it counts against other evidence.
+    """
+
+    side: Side
+    reason: str
+    is_strong: bool = True
+
+
+@dataclass(frozen=True)
+class DrivingSide:
+    """The side on which traffic drives, and a sentence that says why."""
+
+    lefthand: bool
+    note: str
+
+
+@cache
+def _countries() -> tuple[tuple[str, ...], tuple[BaseGeometry, ...], BaseGeometry]:
+    """Return names and outlines of the countries with left-hand traffic, and the border around all of them."""
+    features = json.loads(COUNTRIES_FILE.read_text(encoding="utf-8"))["features"]
+    outlines = tuple(shapely.make_valid(shapely.geometry.shape(feature["geometry"])) for feature in features)
+    names = tuple(feature["properties"]["name"] for feature in features)
+    return names, outlines, shapely.union_all(outlines).boundary
+
+
+def left_hand_country(lat_deg: float, lon_deg: float) -> str | None:
+    """Return the country, island or region with left-hand traffic at a position; None elsewhere.
+
+    >>> left_hand_country(51.13, 1.31), left_hand_country(50.95, 1.86)
+    ('England', None)
+    """
+    names, outlines, _ = _countries()
+    point = Point(lon_deg, lat_deg)
+    return next((name for name, outline in zip(names, outlines, strict=True) if outline.covers(point)), None)
+
+
+def side_at(lat_deg: float, lon_deg: float) -> Evidence | None:
+    """Return the side of traffic at a position in degrees; None for a map that hides its position."""
+    if max(abs(lat_deg), abs(lon_deg)) < ANONYMOUS_DEG:
+        return None
+    country = left_hand_country(lat_deg, lon_deg)
+    side: Side = "right" if country is None else "left"
+    reason = (
+        "the map lies outside the countries with left-hand traffic" if country is None else f"the map lies in {country}"
+    )
+    border_m = _border_m(lat_deg, lon_deg)
+    if border_m < NEAR_BORDER_M:
+        return Evidence(side, f"{reason}, but {border_m / 1000:.1f} km from a border where the side changes", False)
+    return Evidence(side, reason)
+
+
+def _border_m(lat_deg: float, lon_deg: float) -> float:
+    """Return about how far away the side of traffic changes."""
+    _, _, border = _countries()
+    shrink = math.cos(math.radians(lat_deg))
+    reach_deg = 2 * NEAR_BORDER_M / _M_PER_DEG / max(shrink, 0.01)
+    west_deg, south_deg = lon_deg - reach_deg, lat_deg - reach_deg
+    near = shapely.clip_by_rect(border, west_deg, south_deg, lon_deg + reach_deg, lat_deg + reach_deg)
+    if near.is_empty:
+        return math.inf
+    near_m = shapely.transform(near, lambda points: (points - [lon_deg, lat_deg]) * [shrink * _M_PER_DEG, _M_PER_DEG])
+    return float(near_m.distance(Point(0.0, 0.0)))
+
+
+def majority(left: float, right: float, reasons: tuple[str, str]) -> Evidence | None:
+    """Return the evidence of most objects of a map.
+
+    Parameters
+    ----------
+    left, right
+        Number or length of the objects that tell left-hand and right-hand traffic.
+    reasons
+        Why, for left-hand and for right-hand traffic.
+
+    Returns
+    -------
+    Evidence or None
+        None without a majority of :data:`CLEAR_MAJORITY`.
+    """
+    if max(left, right) < CLEAR_MAJORITY * (left + right) or not left + right:
+        return None
+    return Evidence("left", reasons[0]) if left > right else Evidence("right", reasons[1])
+
+
+def choose_side(
+    lefthand: bool | None, of_map: Sequence[Evidence], of_position: Evidence | None, where: str
+) -> DrivingSide:
+    """Decide on which side traffic drives.
+
+    What the map says itself counts more than the position, which may be made up or near a border; an option decides
+    unless all of the map contradicts it.
+
+    Parameters
+    ----------
+    lefthand
+        What the user says (``--lefthand``, ``--righthand``); None for nothing.
+    of_map
+        What the map tells.
+    of_position
+        What its position tells; None if it is unknown.
+    where
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        When the map contradicts the option, itself, or the position and nothing was said.
+    """
+    sides = {evidence.side for evidence in of_map}
+    if lefthand is not None:
+        return _requested_side(lefthand, of_map, of_position, where)
+    if of_position is not None and (of_position.is_strong or not of_map):
+        sides.add(of_position.side)
+        of_map = [*of_map, of_position]
+    if len(sides) > 1:
+        reasons = [
+            ", and ".join(evidence.reason for evidence in of_map if evidence.side == side) for side in ("left", "right")
+        ]
+        problem = f"traffic drives on the left as {reasons[0]}; on the right as {reasons[1]}"
+        raise InputError(where, problem, "State the side: add --lefthand or --righthand.")
+    if not of_map:
+        return DrivingSide(False, "Traffic drives on the right: neither the map nor its position tells otherwise.")
+    side = sides.pop()
+    return DrivingSide(side == "left", f"Traffic drives on the {side}: {', and '.join(e.reason for e in of_map)}.")
+
+
+def _requested_side(
+    lefthand: bool, of_map: Sequence[Evidence], of_position: Evidence | None, where: str
+) -> DrivingSide:
+    side: Side = "left" if lefthand else "right"
+    against = [evidence for evidence in of_map if evidence.side != side]
+    if against and len(against) == len(of_map):
+        problem = (
+            f"{', and '.join(evidence.reason for evidence in against)}, so traffic drives on the {against[0].side}"
+        )
+        raise InputError(where, problem, f"Leave out --{side}hand.")
+    note = f"Traffic drives on the {side}, as requested."
+    if of_position is not None and of_position.side != side:
+        against.append(of_position)
+    if against:
+        note = f"{note[:-1]}, although {', and '.join(evidence.reason for evidence in against)}."
+    return DrivingSide(lefthand, note)
