@@ -57,7 +57,7 @@ class Evidence(NamedTuple):
     reason
         Why, e.g. ``"the map lies in Japan"``.
     is_strong
-        Whether it counts against other evidence.
+        Whether it counts where other evidence contradicts it.
     """
 
     side: Side
@@ -165,37 +165,41 @@ def choose_side(
     InputError
         When the map contradicts the option, itself, or the position and nothing was said.
     """
-    sides = {evidence.side for evidence in of_map}
     if lefthand is not None:
         return _requested_side(lefthand, of_map, of_position, where)
+    evidence = [*of_map]
     if of_position is not None and (of_position.is_strong or not of_map):
-        sides.add(of_position.side)
-        of_map = [*of_map, of_position]
+        evidence.append(of_position)
+    sides = {one.side for one in evidence}
     if len(sides) > 1:
-        reasons = [
-            ", and ".join(evidence.reason for evidence in of_map if evidence.side == side) for side in ("left", "right")
-        ]
-        problem = f"traffic drives on the left as {reasons[0]}; on the right as {reasons[1]}"
-        raise InputError(where, problem, "State the side: add --lefthand or --righthand.")
-    if not of_map:
-        return DrivingSide(False, "Traffic drives on the right: neither the map nor its position tells otherwise.")
+        left, right = (_reasons([one for one in evidence if one.side == side]) for side in ("left", "right"))
+        problem = f"the side of traffic is unclear: the left, as {left}; the right, as {right}"
+        raise InputError(where, problem, "Add --lefthand or --righthand.")
+    if not evidence:
+        return DrivingSide(False, "Traffic drives on the right: neither the map nor its position tells the side.")
     side = sides.pop()
-    return DrivingSide(side == "left", f"Traffic drives on the {side}: {', and '.join(e.reason for e in of_map)}.")
+    note = f"Traffic drives on the {side}: {_reasons(evidence)}"
+    if of_position is not None and of_position.side != side:
+        note = f"{note}, although {of_position.reason}"
+    return DrivingSide(side == "left", f"{note}.")
 
 
 def _requested_side(
     lefthand: bool, of_map: Sequence[Evidence], of_position: Evidence | None, where: str
 ) -> DrivingSide:
     side: Side = "left" if lefthand else "right"
-    against = [evidence for evidence in of_map if evidence.side != side]
+    against = [one for one in of_map if one.side != side]
     if against and len(against) == len(of_map):
-        problem = (
-            f"{', and '.join(evidence.reason for evidence in against)}, so traffic drives on the {against[0].side}"
-        )
+        other = against[0].side
+        problem = f"is for {other}-hand traffic: {_reasons(against)}, so traffic drives on the {other}"
         raise InputError(where, problem, f"Leave out --{side}hand.")
-    note = f"Traffic drives on the {side}, as requested."
+    note = f"Traffic drives on the {side}, as requested"
     if of_position is not None and of_position.side != side:
         against.append(of_position)
     if against:
-        note = f"{note[:-1]}, although {', and '.join(evidence.reason for evidence in against)}."
-    return DrivingSide(lefthand, note)
+        note = f"{note}, although {_reasons(against)}"
+    return DrivingSide(lefthand, f"{note}.")
+
+
+def _reasons(evidence: Sequence[Evidence]) -> str:
+    return ", and ".join(one.reason for one in evidence)

@@ -20,6 +20,7 @@ from xml.sax.saxutils import quoteattr
 from egvs.core import files
 from egvs.core.wording import by_number, list_first, number_of
 from egvs.traffic import sumo
+from egvs.traffic.network import TURNAROUNDS
 
 MOST_LISTED = 5
 
@@ -50,20 +51,26 @@ class BuiltTurns:
     ----------
     connections
         Those between roads.
+    u_turns
+        Those that lead back to the road that they come from.
     ends
         The nodes where each edge starts and ends.
     """
 
     connections: set[Connection] = field(default_factory=set)
+    u_turns: set[Connection] = field(default_factory=set)
     ends: dict[str, tuple[str, str]] = field(default_factory=dict)
 
     def add(self, element: Element) -> None:
         """Take an element of a ``.net.xml``; only edges and connections count."""
         if element.tag == "edge" and not element.get("function"):
             self.ends[element.attrib["id"]] = element.get("from", ""), element.get("to", "")
-        elif element.tag == "connection" and not element.attrib["from"].startswith(":"):
+        elif element.tag == "connection" and ":" not in (element.attrib["from"][:1], element.attrib["to"][:1]):
             source_lane, target_lane = int(element.attrib["fromLane"]), int(element.attrib["toLane"])
-            self.connections.add(Connection(element.attrib["from"], source_lane, element.attrib["to"], target_lane))
+            connection = Connection(element.attrib["from"], source_lane, element.attrib["to"], target_lane)
+            self.connections.add(connection)
+            if element.get("dir") in TURNAROUNDS:
+                self.u_turns.add(connection)
 
     def can_connect(self, source: str, target: str) -> bool:
         """Return whether an edge ends at the node where another one starts: only such edges can be connected."""
@@ -91,7 +98,7 @@ class TurnComparison(Generic[Turn]):
     added: tuple[Turn, ...]
 
 
-def compare_turns(permitted: Set[Turn], built: Set[Turn], tolerated: Collection[Turn] = ()) -> TurnComparison[Turn]:
+def compare_turns(permitted: Set[Turn], built: Set[Turn], tolerated: Iterable[Turn] = ()) -> TurnComparison[Turn]:
     """Compare the turns of a map with those of a network.
 
     Parameters
