@@ -146,8 +146,8 @@ def choose_side(
 ) -> DrivingSide:
     """Decide on which side traffic drives.
 
-    What the map says itself counts more than the position, which may be made up or near a border; an option decides
-    unless all of the map contradicts it.
+    An option overrides the position, which may be made up, and a map that contradicts itself or its position. It does
+    not override a map that tells the other side, and whose position does not tell otherwise.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def choose_side(
     Raises
     ------
     InputError
-        When the map contradicts the option, itself, or the position and nothing was said.
+        When the map contradicts the option, or nothing was said and the map contradicts itself or its position.
     """
     if lefthand is not None:
         return _requested_side(lefthand, of_map, of_position, where)
@@ -189,7 +189,8 @@ def _requested_side(
 ) -> DrivingSide:
     side: Side = "left" if lefthand else "right"
     against = [one for one in of_map if one.side != side]
-    if against and len(against) == len(of_map):
+    is_supported = of_position is not None and of_position.is_strong and of_position.side == side
+    if against and len(against) == len(of_map) and not is_supported:
         other = against[0].side
         problem = f"is for {other}-hand traffic: {_reasons(against)}, so traffic drives on the {other}"
         raise InputError(where, problem, f"Leave out --{side}hand.")

@@ -20,7 +20,7 @@ from xml.sax.saxutils import quoteattr
 from egvs.core import files
 from egvs.core.wording import by_number, list_first, number_of
 from egvs.traffic import sumo
-from egvs.traffic.network import TURNAROUNDS
+from egvs.traffic.network import CAR, TURNAROUNDS, Permission
 
 MOST_LISTED = 5
 
@@ -50,7 +50,7 @@ class BuiltTurns:
     Attributes
     ----------
     connections
-        Those between roads.
+        Those between roads that cars may use.
     u_turns
         Those that lead back to the road that they come from.
     ends
@@ -65,7 +65,9 @@ class BuiltTurns:
         """Take an element of a ``.net.xml``; only edges and connections count."""
         if element.tag == "edge" and not element.get("function"):
             self.ends[element.attrib["id"]] = element.get("from", ""), element.get("to", "")
-        elif element.tag == "connection" and ":" not in (element.attrib["from"][:1], element.attrib["to"][:1]):
+            return
+        is_on_roads = element.tag == "connection" and ":" not in (element.attrib["from"][:1], element.attrib["to"][:1])
+        if is_on_roads and Permission.from_attributes(element.attrib).admits(CAR):
             source_lane, target_lane = int(element.attrib["fromLane"]), int(element.attrib["toLane"])
             connection = Connection(element.attrib["from"], source_lane, element.attrib["to"], target_lane)
             self.connections.add(connection)

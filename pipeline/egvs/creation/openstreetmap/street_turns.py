@@ -24,7 +24,6 @@ from egvs.core.wording import by_number, list_first, number_of
 from egvs.creation.openstreetmap.restrictions import (
     Progress,
     Restriction,
-    Restrictions,
     Step,
     TurnRules,
     read_restrictions,
@@ -191,20 +190,18 @@ class StreetGraph:
                     self._leaving.setdefault(way.nodes[index], []).append(Step(way.id, index, False))
         self._edge_of_first = {edge.steps[0]: edge.id for edge in self.edges.values()}
         self._on_edges = {step for edge in self.edges.values() for step in edge.steps}
+        self._nodes = {node for step in self._on_edges for node in (self.start_node(step), self.end_node(step))}
         in_force = [restriction for restriction in self.restrictions.in_force if self._reaches_target(restriction)]
         self.rules = TurnRules(in_force, self._ways)
         self.without_target = tuple(r.id for r in self.restrictions.in_force if r not in in_force)
 
     def _reaches_target(self, restriction: Restriction) -> bool:
         """Return whether the network has the street that a restriction leaves open, if it leaves only one open."""
-        on_edges = {step.way for step in self._on_edges}
-        return not restriction.only or bool(restriction.targets & on_edges) or self._is_inside(restriction.targets)
+        return not restriction.only or any(self._is_in_network(way) for way in restriction.targets)
 
-    def _is_inside(self, ways: Collection[int]) -> bool:
-        """Return whether ways lie inside junctions of the network: both ends are nodes of edges."""
-        ends = {self.end_node(edge.steps[-1]) for edge in self.edges.values()}
-        ends |= {self.start_node(edge.steps[0]) for edge in self.edges.values()}
-        return any({self._ways[way].nodes[0], self._ways[way].nodes[-1]} <= ends for way in ways if way in self._ways)
+    def _is_in_network(self, way: int) -> bool:
+        """Return whether a way is on edges, or inside a junction between them."""
+        return way in self._ways and bool(self._nodes & {*self._ways[way].nodes})
 
     def _add_edge(self, element: Element) -> None:
         edge_id = element.attrib["id"]
@@ -371,9 +368,8 @@ class StreetGraph:
 
     def is_in_network(self, relation: int) -> bool:
         """Return whether both ends of a restriction are streets of the network."""
-        on_edges = {step.way for step in self._on_edges}
         members = next(r for r in self._extract.relations if r.id == relation)
-        return all(on_edges & {*members.ways(role)} for role in ("from", "to"))
+        return all(any(map(self._is_in_network, members.ways(role))) for role in ("from", "to"))
 
     def beyond_junctions(self) -> tuple[int, ...]:
         """Return the restrictions over ways that are edges of their own: no connection can express them."""
@@ -541,8 +537,9 @@ def _connection(graph: StreetGraph, pair: Pair, *, lefthand: bool) -> Connection
 
 def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
     graph = after.graph
+    closed = [pair for pair in before.added if pair not in after.added]
     yield from turn_notes(
-        closed=[graph.title(pair, before.relations[pair]) for pair in before.added if pair not in after.added],
+        closed=[graph.title(pair, before.relations[pair]) for pair in closed],
         opened=[graph.title(pair) for pair in before.lost if pair not in after.lost],
         lost=[graph.title(pair) for pair in after.lost],
         added=[graph.title(pair, after.relations[pair]) for pair in after.added],
@@ -559,18 +556,28 @@ def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
             f"{number_of(count, 'turn')} of the network {by_number(count, 'has', 'have')} no arrow on the lanes of the"
             f" map (turn:lanes): {turns}."
         )
-    yield from _restriction_notes(graph, graph.restrictions)
+    yield from _restriction_notes(graph, {relation for pair in closed for relation in before.relations[pair]})
     if graph.unknown:
         edges = list_first(graph.unknown, MOST_LISTED)
         yield f"The turns of {number_of(len(graph.unknown), 'edge')} could not be compared with the map: {edges}."
 
 
-def _restriction_notes(graph: StreetGraph, restrictions: Restrictions) -> Iterator[str]:
-    """Yield sentences on the restrictions that a network cannot express."""
+def _restriction_notes(graph: StreetGraph, closed: Collection[int]) -> Iterator[str]:
+    """Yield sentences on the restrictions that a network cannot express.
+
+    Parameters
+    ----------
+    graph
+        The streets.
+    closed
+        The restrictions for which turns were closed.
+    """
+    restrictions = graph.restrictions
+    excepting = [relation for relation in restrictions.with_exceptions if relation in closed]
     rows = (
         (restrictions.conditional, "at certain times only, and are left out"),
-        (restrictions.by_vehicle, "for certain vehicles only, and are left out"),
-        (restrictions.with_exceptions, "for all but certain vehicles; here they hold for all"),
+        (restrictions.by_vehicle, "for certain vehicles only, and were not compared with the network"),
+        (excepting, "for all but certain vehicles; here they hold for all"),
     )
     for relations, what in rows:
         in_network = [str(relation) for relation in relations if graph.is_in_network(relation)]
