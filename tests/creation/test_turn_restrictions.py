@@ -47,9 +47,7 @@ class MapDraft:
         """Add a turn restriction; return its identifier."""
         number = len(self.relations) + 901
         members = (Member("way", source, "from"), *via, Member("way", target, "to"))
-        self.relations.append(
-            Relation(number, members, {"type": "restriction", "restriction": kind, "except": excepted})
-        )
+        self.relations.append(Relation(number, members, {"type": "restriction", "restriction": kind}))
         return number
 
     def via(self, point: XY) -> list[Member]:
