@@ -143,7 +143,7 @@ def test_repaired_network_is_otherwise_the_same() -> None:
         ({"restriction": "no_left_turn", "except": "motorcar"}, True,
          "for certain vehicles only, and were not compared with the network"),
         ({"restriction": "no_left_turn", "except": "bus;bicycle"}, False,
-         "for all but certain vehicles; here they hold for all"),
+         "for all but certain vehicles; in the network they may hold for these, too"),
     ],
 )  # fmt: skip
 def test_restrictions_that_a_network_cannot_keep_are_named(tags: dict[str, str], is_open: bool, expected: str) -> None:

@@ -556,28 +556,19 @@ def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
             f"{number_of(count, 'turn')} of the network {by_number(count, 'has', 'have')} no arrow on the lanes of the"
             f" map (turn:lanes): {turns}."
         )
-    yield from _restriction_notes(graph, {relation for pair in closed for relation in before.relations[pair]})
+    yield from _restriction_notes(graph)
     if graph.unknown:
         edges = list_first(graph.unknown, MOST_LISTED)
         yield f"The turns of {number_of(len(graph.unknown), 'edge')} could not be compared with the map: {edges}."
 
 
-def _restriction_notes(graph: StreetGraph, closed: Collection[int]) -> Iterator[str]:
-    """Yield sentences on the restrictions that a network cannot express.
-
-    Parameters
-    ----------
-    graph
-        The streets.
-    closed
-        The restrictions for which turns were closed.
-    """
+def _restriction_notes(graph: StreetGraph) -> Iterator[str]:
+    """Yield sentences on the restrictions that a network cannot express."""
     restrictions = graph.restrictions
-    excepting = [relation for relation in restrictions.with_exceptions if relation in closed]
     rows = (
         (restrictions.conditional, "at certain times only, and are left out"),
         (restrictions.by_vehicle, "for certain vehicles only, and were not compared with the network"),
-        (excepting, "for all but certain vehicles; here they hold for all"),
+        (restrictions.with_exceptions, "for all but certain vehicles; in the network they may hold for these, too"),
     )
     for relations, what in rows:
         in_network = [str(relation) for relation in relations if graph.is_in_network(relation)]
