@@ -141,6 +141,13 @@ def majority(left: float, right: float, reasons: tuple[str, str]) -> Evidence | 
     return Evidence("left", reasons[0]) if left > right else Evidence("right", reasons[1])
 
 
+def requested_left(*, lefthand: bool, righthand: bool) -> bool | None:
+    """Return whether left-hand traffic was requested; None if nothing was, InputError if both sides were."""
+    if lefthand and righthand:
+        raise InputError("--lefthand", "cannot be combined with --righthand", "Use one of them.")
+    return lefthand if lefthand or righthand else None
+
+
 def choose_side(
     lefthand: bool | None, of_map: Sequence[Evidence], of_position: Evidence | None, where: str
 ) -> DrivingSide:

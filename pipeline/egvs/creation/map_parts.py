@@ -22,6 +22,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.creation import driving_side
 from egvs.creation.junctions import Streets
 from egvs.formats.georeference import WorldFrame, parse_crs
 from egvs.scenario.fields import MAX_COORDINATE_M
@@ -175,8 +176,9 @@ class RoadOptions:
 
     Attributes
     ----------
-    lefthand
-        Whether traffic drives on the left; None where the map and its position decide.
+    lefthand, righthand
+        Whether the user says that traffic drives on the left, or on the right; if neither, the map and its position
+        decide.
     walk
         Whether the network gets sidewalks and crossings.
     has_terrain
@@ -187,10 +189,16 @@ class RoadOptions:
         None if any will do. A reader may reject a position outside its map.
     """
 
-    lefthand: bool | None = None
+    lefthand: bool = False
     walk: bool = False
     has_terrain: bool = False
     at: tuple[float, float] | None = None
+    righthand: bool = False
+
+    @property
+    def requested_left(self) -> bool | None:
+        """Whether left-hand traffic was requested; None if nothing was."""
+        return driving_side.requested_left(lefthand=self.lefthand, righthand=self.righthand)
 
 
 @dataclass(frozen=True)

@@ -23,15 +23,15 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     path
         The network, gzipped or not.
     options
-        ``lefthand`` and ``walk`` must not be set: both are fixed in a network.
+        The side of traffic and ``walk`` must not be set: both are fixed in a network.
 
     Raises
     ------
     InputError
         When the network is damaged, or an option is set.
     """
-    if options.lefthand is not None or options.walk:
-        option = "--walk" if options.lefthand is None else "--lefthand" if options.lefthand else "--righthand"
+    if options.lefthand or options.righthand or options.walk:
+        option = "--lefthand" if options.lefthand else "--righthand" if options.righthand else "--walk"
         hint = "Leave it out, or make the network anew with netconvert."
         raise InputError(option, f"the SUMO network {path} has its own side of the road and sidewalks", hint)
     roads = network.read_net_xml(path)

@@ -91,7 +91,7 @@ class OsmRoads:
         """
         extract = osm_files.read_osm(path)
         check_inside_extract(extract, options.at)
-        side = choose_map_side(extract, options.lefthand, options.at, str(path))
+        side = choose_map_side(extract, options.requested_left, options.at, str(path))
         flags = osm_network.netconvert_flags(extract, lefthand=side.lefthand, walk=options.walk)
         notes = side.note, *exceptions_note(extract, lefthand=side.lefthand)
         if options.has_terrain:

@@ -57,7 +57,7 @@ def _of_rings(extract: OsmExtract) -> Evidence | None:
         if tags.get("highway") == "mini_roundabout" and clockwise is not None:
             names[clockwise].append(f"node {node}")
     reasons = [
-        f"{by_number(len(rings), 'the roundabout', number_of(len(rings), 'roundabout'))}"
+        f"{by_number(len(rings), 'the one-way ring', number_of(len(rings), 'one-way ring'))}"
         f" ({list_first(sorted(rings), _LISTED)}) {by_number(len(rings), 'runs', 'run')} {direction}"
         for rings, direction in ((names[True], "clockwise"), (names[False], "counter-clockwise"))
     ]

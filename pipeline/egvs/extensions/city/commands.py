@@ -73,11 +73,10 @@ def new(
         ),
     ] = "signalised",
     lefthand: Annotated[
-        bool | None,
-        typer.Option(
-            "--lefthand/--righthand", help="The side on which traffic drives; by default, that of the map or country."
-        ),
-    ] = None,
+        bool,
+        typer.Option("--lefthand", help="Traffic drives on the left; by default, the map and its position decide."),
+    ] = False,
+    righthand: Annotated[bool, typer.Option("--righthand", help="Traffic drives on the right.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
     traffic: Annotated[
         str,
@@ -97,7 +96,9 @@ def new(
     with ProgressDisplay("city") as screen:
         from egvs.extensions.city import creation, new_summary
 
-        new_options = creation.NewCityOptions(centre, radius_m, junctions, lefthand, walk, traffic, screen.progress)
+        new_options = creation.NewCityOptions(
+            centre, radius_m, junctions, lefthand, walk, traffic, screen.progress, righthand
+        )  # fmt: skip
         created = creation.create_city(folder, osm, new_options)
     new_summary.print_new_city(created)
 

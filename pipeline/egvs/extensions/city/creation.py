@@ -33,6 +33,7 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import format_percent
 from egvs.creation import assumed_traffic, junctions, new_scenario, scenario_files
 from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, TRAFFIC_LEVELS
+from egvs.creation.driving_side import requested_left
 from egvs.creation.junctions import HEIGHTS_M, JunctionRegion, KerbsidePole, NearbyJunction, StreetJunction, Streets
 from egvs.creation.map_parts import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap import ATTRIBUTION
@@ -188,7 +189,7 @@ class NewCityOptions:
         ``around`` is None.
     which
         ``"signalised"``, ``"all"``, or the path of a table, see :func:`choose_junctions`.
-    lefthand, walk
+    lefthand, righthand, walk
         As in :func:`egvs.creation.new_scenario.NewScenarioOptions`.
     traffic
         A key of :data:`egvs.creation.assumed_traffic.TRAFFIC_LEVELS`: the share of the flow that the network carries.
@@ -199,10 +200,11 @@ class NewCityOptions:
     around: tuple[float, float] | None = None
     radius_m: float | None = None
     which: str = SIGNALISED
-    lefthand: bool | None = None
+    lefthand: bool = False
     walk: bool = False
     traffic: str = DEFAULT_TRAFFIC
     progress: ProgressCallback = no_progress
+    righthand: bool = False
 
 
 def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) -> NewCity:
@@ -227,6 +229,7 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     options = options or NewCityOptions()
     around, radius_m, which = options.around, options.radius_m, options.which
     assumed_traffic.check_traffic_level(options.traffic)
+    side_option = requested_left(lefthand=options.lefthand, righthand=options.righthand)
     name = scenario_files.check_new_folder(folder)
     if radius_m is not None and around is None:
         raise InputError("--radius", "given without --around", "Add --around LAT,LON.")
@@ -236,7 +239,7 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     street_extract, rim_m = extract, radius_m or DEFAULT_RADIUS_M
     if around is not None:
         street_extract = osm_network.cut_surroundings(extract, around, rim_m)
-    side = choose_map_side(extract, options.lefthand, around, str(osm))
+    side = choose_map_side(extract, side_option, around, str(osm))
     flags = osm_network.netconvert_flags(extract, lefthand=side.lefthand, walk=options.walk)
     network, streets, turn_notes = osm_network.build_network(street_extract, osm, flags)
     within = None

@@ -76,7 +76,7 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     if not graph.lanelets:
         raise InputError(path, "has no lanelets for motor vehicles", _NO_ROADS_HINT)
     with translate_errors(path, "Correct the map in an editor.", "its lanelets cannot be made into roads"):
-        side = rules.choose_driving_side(graph, options.lefthand, _side_of_position(points), str(path))
+        side = rules.choose_driving_side(graph, options.requested_left, _side_of_position(points), str(path))
         crosswalk_lanelets = _crosswalks(lanelet_map, points.xyz_m) if options.walk else []
         layout = make_roads(graph, lefthand=side.lefthand, crosswalks=crosswalk_lanelets)
         if not layout.roads:

@@ -84,7 +84,7 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     road_map = opendrive.read_opendrive(path)
     check_size(road_map, path)
     reference, notes = _projection(road_map, path)
-    side = _choose_side(road_map, reference, options.lefthand, path)
+    side = _choose_side(road_map, reference, options.requested_left, path)
     lefthand = side.lefthand
     copy_options = CopyOptions(
         reference,
