@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from egvs.core.errors import InputError
-from egvs.creation import driving_side
+from egvs.creation import driving_side, sumo_network
 from egvs.creation.driving_side import Evidence, choose_side, side_at
+from egvs.creation.map_parts import RoadOptions
 from egvs.creation.openstreetmap.side_evidence import choose_map_side, exceptions_note, side_evidence
 from egvs.formats import osm
 from egvs.formats.osm import Bounds, OsmExtract, Relation, Way
@@ -207,6 +208,22 @@ def test_streets_on_the_other_side_are_named() -> None:
     side = choose_map_side(made, None, None, "map.osm")
     (note,) = exceptions_note(made, lefthand=side.lefthand)
     assert note.startswith("On 1 street of the map, traffic drives on the left") and note.endswith("only: Ramp.")
+
+
+NETWORK = """<net version="1.20"><location netOffset="-300000.0,-3900000.0" projParameter="+proj=utm +zone={} +datum=WGS84"/>
+<edge id="a" from="1" to="2"><lane id="a_0" index="0" speed="9" length="9" shape="0,0 9,0"/></edge></net>
+"""
+
+
+def test_network_for_the_wrong_side_is_reported(tmp_path: Path) -> None:
+    """In Japan; the other one is in Tunisia."""
+    (tmp_path / "n.net.xml").write_text(NETWORK.format(54), encoding="utf-8")
+    (note,) = sumo_network.read_roads(tmp_path / "n.net.xml", RoadOptions()).notes
+    assert note.startswith("Traffic drives on the right in the network, although the map lies in Japan")
+    (tmp_path / "n.net.xml").write_text(NETWORK.format(54).replace("<net ", '<net lefthand="true" '), encoding="utf-8")
+    assert not sumo_network.read_roads(tmp_path / "n.net.xml", RoadOptions()).notes
+    (tmp_path / "n.net.xml").write_text(NETWORK.format(32), encoding="utf-8")
+    assert not sumo_network.read_roads(tmp_path / "n.net.xml", RoadOptions()).notes
 
 
 REAL = Path(__file__).parents[3] / "shared" / "real"

@@ -113,6 +113,25 @@ def test_restriction_inside_junction_is_kept(walk: bool) -> None:
     assert walkways[0].crossings == walkways[1].crossings and bool(walkways[0].crossings) == walk
 
 
+def test_restriction_between_objects_without_numbers_of_openstreetmap_is_kept() -> None:
+    """Editors give new objects negative numbers: edge -11 is way -11, not way 11 against its direction."""
+    draft, ways = divided_road()
+    draft.restrict("no_left_turn", ways["middle"], draft.via((0.0, -APART_M)), ways["to east"])
+    made = draft.extract()
+    negative = replace(
+        made,
+        nodes={-number: at for number, at in made.nodes.items()},
+        node_tags={-number: tags for number, tags in made.node_tags.items()},
+        ways={-way.id: Way(-way.id, tuple(-n for n in way.nodes), way.tags) for way in made.ways.values()},
+        relations=tuple(
+            replace(r, id=-r.id, members=tuple(m._replace(id=-m.id) for m in r.members)) for r in made.relations
+        ),
+    )
+    turns = edge_turns(build(negative))
+    assert (f"-{ways['north']}", f"-{ways['to east']}") not in turns
+    assert (f"-{ways['north']}", f"-{ways['south']}") in turns and len(turns) == len(edge_turns(build(made)))
+
+
 def test_restriction_over_way_inside_junction_is_kept() -> None:
     """From the north to the east is forbidden; from the west to the east is not."""
     draft, ways = divided_road()

@@ -24,11 +24,13 @@ from functools import cache
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+import numpy as np
 import shapely
 from shapely.geometry import Point
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
+from egvs.formats.georeference import WorldFrame
 
 Side = Literal["left", "right"]
 
@@ -106,6 +108,17 @@ def side_at(lat_deg: float, lon_deg: float) -> Evidence | None:
     if border_m < NEAR_BORDER_M:
         return Evidence(side, f"{reason}, but {border_m / 1000:.1f} km from a border where the side changes", False)
     return Evidence(side, reason)
+
+
+def side_in_frame(frame: WorldFrame | None, at_m: Sequence[float]) -> Evidence | None:
+    """Return the side of traffic at a position of a world frame, as weak evidence beside lanes that tell the side; None
+    where the frame is unknown.
+    """
+    if frame is None:
+        return None
+    ((lon_deg, lat_deg),) = frame.to_degrees(np.array([at_m[:2]], dtype=np.float64)).tolist()
+    evidence = side_at(lat_deg, lon_deg) if math.isfinite(lat_deg + lon_deg) else None
+    return None if evidence is None else evidence._replace(is_strong=False)
 
 
 def _border_m(lat_deg: float, lon_deg: float) -> float:

@@ -54,7 +54,7 @@ _HEADING_M = 15.0
 _STRAIGHT_DEG = 30.0
 _EARTH_M = 6371008.8
 
-_EDGE_ID = re.compile(r"(-?)(\d+)(?:#\d+)?")
+_INTEGER = re.compile(r"-?\d+")
 _ORIGIN_PARAMS = re.compile(r'\n *<param key="orig(?:Id|EdgeIds|From|To)" value="[^"]*"/>')
 _EMPTY_ELEMENT = re.compile(r"(<(lane|junction)\b[^>]*[^/])>\s*</\2>")
 
@@ -218,7 +218,7 @@ class StreetGraph:
             if Permission.from_attributes(lane.attrib).admits(CAR)
         ]
         start, end = params.get("origFrom", element.get("from", "")), params.get("origTo", element.get("to", ""))
-        steps = self._steps(edge_id, start, end, {int(name) for name in names if name.isdecimal()})
+        steps = self._steps(edge_id, start, end, {int(name) for name in names if _INTEGER.fullmatch(name)})
         if steps:
             nodes = element.get("from", ""), element.get("to", "")
             self.edges[edge_id] = StreetEdge(edge_id, *nodes, steps, tuple(lanes))
@@ -227,15 +227,18 @@ class StreetGraph:
 
     def _steps(self, edge_id: str, start: str, end: str, ways: Collection[int]) -> tuple[Step, ...]:
         """Return the pieces of ways of an edge; empty if they cannot be told."""
-        match = _EDGE_ID.fullmatch(edge_id)
-        if match is None or not start.isdecimal() or not end.isdecimal() or int(match[2]) not in self._ways:
+        if not _INTEGER.fullmatch(start) or not _INTEGER.fullmatch(end):
             return ()
-        way, forward = self._ways[int(match[2])], not match[1]
-        walks = [
-            self._walk(Step(way.id, index, forward), int(end), {*ways} | {way.id})
-            for index, node in enumerate(way.nodes)
-            if node == int(start)
-        ]
+        # editors give new objects negative numbers, so -7 may be way -7, or way 7 against its direction
+        name = edge_id.partition("#")[0]
+        candidates = [(name, True), *([(name[1:], False)] if name.startswith("-") else [])]
+        walks = []
+        for number, forward in candidates:
+            way = int(number) if _INTEGER.fullmatch(number) else None
+            nodes = self._ways[way].nodes if way in self._ways else ()
+            for index, node in enumerate(nodes):
+                if way is not None and node == int(start):
+                    walks.append(self._walk(Step(way, index, forward), int(end), {*ways, way}))
         return min((walk for walk in walks if walk), key=len, default=())
 
     def _walk(self, step: Step, end: int, ways: Collection[int]) -> tuple[Step, ...]:
@@ -249,7 +252,7 @@ class StreetGraph:
                 if nodes[step.end] == end:
                     return tuple(steps)
                 step = Step(step.way, step.end, step.forward)
-            elif nodes[0] == nodes[-1]:
+            elif nodes[0] == nodes[-1] and len(nodes) > 1:
                 step = Step(step.way, 0 if step.forward else len(nodes) - 1, step.forward)
             else:
                 next_step = self._continue(nodes[step.start], rest)

@@ -7,7 +7,6 @@ and what is wrong in it is reported in the notes, by the identifiers of lanelets
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +19,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import translate_errors
 from egvs.core.wording import number_of
-from egvs.creation.driving_side import Evidence, side_at
+from egvs.creation.driving_side import side_in_frame
 from egvs.creation.map_parts import RoadMap, RoadOptions
 from egvs.creation.turns import turn_notes
 from egvs.extensions.maps.formats.lanelet2 import LaneletMap, is_lanelet2, read_lanelet2
@@ -76,7 +75,10 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     if not graph.lanelets:
         raise InputError(path, "has no lanelets for motor vehicles", _NO_ROADS_HINT)
     with translate_errors(path, "Correct the map in an editor.", "its lanelets cannot be made into roads"):
-        side = rules.choose_driving_side(graph, options.requested_left, _side_of_position(points), str(path))
+        middle_m = np.mean(list(points.xyz_m.values()), axis=0)
+        side = rules.choose_driving_side(
+            graph, options.requested_left, side_in_frame(points.frame, middle_m), str(path)
+        )
         crosswalk_lanelets = _crosswalks(lanelet_map, points.xyz_m) if options.walk else []
         layout = make_roads(graph, lefthand=side.lefthand, crosswalks=crosswalk_lanelets)
         if not layout.roads:
@@ -102,16 +104,6 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         *_quality_notes(quality, builder.lane_changes.opened),
     )
     return RoadMap(network, notes=notes, has_heights=points.has_heights)
-
-
-def _side_of_position(points: ProjectedPoints) -> Evidence | None:
-    """Return the side of traffic where a map lies; its lanes count more."""
-    if points.frame is None or not points.xyz_m:
-        return None
-    middle_m = np.mean(list(points.xyz_m.values()), axis=0)[None, :2]
-    ((lon_deg, lat_deg),) = points.frame.to_degrees(middle_m).tolist()
-    evidence = side_at(lat_deg, lon_deg) if math.isfinite(lat_deg + lon_deg) else None
-    return None if evidence is None else evidence._replace(is_strong=False)
 
 
 def _without_tiny(graph: LaneletGraph) -> tuple[LaneletGraph, list[LaneletKey]]:

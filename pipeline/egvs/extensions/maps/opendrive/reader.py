@@ -14,7 +14,6 @@ World frame: that of the network, x east, y north in metres. Without a projectio
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -26,7 +25,7 @@ import numpy as np
 from egvs.core import files, limits
 from egvs.core.errors import InputError
 from egvs.core.wording import by_number, list_first, number_of
-from egvs.creation.driving_side import DrivingSide, Evidence, choose_side, majority, side_at
+from egvs.creation.driving_side import DrivingSide, Evidence, choose_side, majority, side_in_frame
 from egvs.creation.map_parts import RoadMap, RoadOptions
 from egvs.creation.terrain import draping, network_heights
 from egvs.creation.turns import Connection, list_turns, patch_network
@@ -190,10 +189,7 @@ def _side_of_position(road_map: OpenDriveMap, reference: str, path: Path) -> Evi
     if not reference or start is None:
         return None
     frame = georeference.WorldFrame.from_projection(reference, (0.0, 0.0), str(path))
-    start_m = np.array([[start.x_m, start.y_m]]) + road_map.offset_m[:2]
-    ((lon_deg, lat_deg),) = frame.to_degrees(start_m).tolist()
-    evidence = side_at(lat_deg, lon_deg) if math.isfinite(lat_deg + lon_deg) else None
-    return None if evidence is None else evidence._replace(is_strong=False)
+    return side_in_frame(frame, np.add((start.x_m, start.y_m), road_map.offset_m[:2]).tolist())
 
 
 def _projection(road_map: OpenDriveMap, path: Path) -> tuple[str, tuple[str, ...]]:
