@@ -210,7 +210,8 @@ def test_streets_on_the_other_side_are_named() -> None:
     assert note.startswith("On 1 street of the map, traffic drives on the left") and note.endswith("only: Ramp.")
 
 
-NETWORK = """<net version="1.20"><location netOffset="-300000.0,-3900000.0" projParameter="+proj=utm +zone={} +datum=WGS84"/>
+NETWORK = """<net version="1.20">
+<location netOffset="-300000.0,-3900000.0" projParameter="+proj=utm +zone={} +datum=WGS84"/>
 <edge id="a" from="1" to="2"><lane id="a_0" index="0" speed="9" length="9" shape="0,0 9,0"/></edge></net>
 """
 
