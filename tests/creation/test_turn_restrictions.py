@@ -188,17 +188,26 @@ def test_restriction_over_street_between_junctions_is_named() -> None:
     assert note.endswith(f"the turns stay open: 1 (relation {relation}).")
 
 
-def test_arrows_on_lanes_are_compared() -> None:
+@pytest.mark.parametrize(
+    ("arrows", "number"),
+    [("through|through", 1), ("left;through|through", 0), ("through|left", 2), ("|", 0), ("through|through|left", 0)],
+)
+def test_arrows_on_lanes_are_compared(arrows: str, number: int) -> None:
+    """The right lane leads straight on, the left one straight on and to the left."""
     draft = MapDraft()
     middle = (0.0, 0.0)
-    source = draft.way((-ARM_M, 0.0), middle, oneway="yes", lanes="2", **{"turn:lanes": "through|through"})
-    draft.way(middle, (ARM_M, 0.0))
+    source = draft.way((-ARM_M, 0.0), middle, oneway="yes", lanes="2", **{"turn:lanes": arrows})
+    ahead = draft.way(middle, (ARM_M, 0.0), oneway="yes", lanes="2")
     target = draft.way(middle, (0.0, ARM_M))
     made = build(draft.extract())
-    assert (str(source), str(target)) in edge_turns(made)
-    (note,) = notes(made)
-    turn = f"Street {source} to Street {target} at 52.00000,10.00000"
-    assert note == f"1 turn of the network has no arrow on the lanes of the map (turn:lanes): {turn}."
+    lanes = {(c.source_lane, made.streets.network.edges[c.target].id) for c in made.streets.network.connections
+             if made.streets.network.edges[c.source].id == str(source)}  # fmt: skip
+    assert lanes == {(0, str(ahead)), (1, str(ahead)), (1, str(target))}
+    found = [note for note in notes(made) if "turn:lanes" in note]
+    assert [int(note.split()[0]) for note in found] == ([number] if number else [])
+    if number == 1:
+        turn = f"Street {source} to Street {target} at 52.00000,10.00000"
+        assert found == [f"1 connection of lanes does not follow the arrows of the map (turn:lanes): {turn}."]
 
 
 def test_restriction_follows_the_piece_of_a_street_that_was_cut() -> None:

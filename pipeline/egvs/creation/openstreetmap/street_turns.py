@@ -164,10 +164,13 @@ class StreetGraph:
         The map.
     network
         The network, made with :data:`ORIGINAL_NAMES_FLAG`.
+    lefthand
+        Whether traffic drives on the left.
     """
 
-    def __init__(self, extract: OsmExtract, network: Path) -> None:
+    def __init__(self, extract: OsmExtract, network: Path, *, lefthand: bool) -> None:
         self._extract = extract
+        self.lefthand = lefthand
         self._ways = {way.id: _mapped(way, extract) for way in extract.ways.values() if "highway" in way.tags}
         self.restrictions = read_restrictions(extract)
         self.built = BuiltTurns()
@@ -353,9 +356,32 @@ class StreetGraph:
     def follows_arrows(self, turn: MapTurn) -> bool:
         """Return whether a lane has an arrow for a turn, or some lane has none."""
         step = self.edges[turn.source].steps[-1]
-        arrows = _arrows(self._ways[step.way].tags, forward=step.forward)
-        turned_deg = _wrap_deg(self.turned_deg(turn.source, turn.target))
+        lanes = _arrows(self._ways[step.way].tags, forward=step.forward)
+        return not all(lanes) or self._fits(frozenset().union(*lanes), turn.source, turn.target)
+
+    def _fits(self, arrows: frozenset[str], source: str, target: str) -> bool:
+        """Return whether one of some arrows can mean a turn; true without arrows."""
+        turned_deg = _wrap_deg(self.turned_deg(source, target))
         return not arrows or any(low <= turned_deg <= high for low, high in map(_ARROWS_DEG.__getitem__, arrows))
+
+    def connections_off_arrows(self) -> Iterator[Connection]:
+        """Yield the connections from lanes whose arrows mean other turns, where a street leads to several others."""
+        by_pair = lanes_of_pairs(self.built.connections)
+        targets: dict[str, list[str]] = {}
+        for source, target in by_pair:
+            is_known = source in self.edges and target in self.edges
+            if is_known and not self.is_same_street(source, target):
+                targets.setdefault(source, []).append(target)
+        for source in sorted(source for source, others in targets.items() if len(others) > 1):
+            edge = self.edges[source]
+            lanes = _arrows(self._ways[edge.steps[-1].way].tags, forward=edge.steps[-1].forward)
+            if len(lanes) != len(edge.car_lanes):
+                continue
+            arrows = dict(zip(edge.car_lanes, lanes if self.lefthand else lanes[::-1], strict=True))
+            for target in sorted(targets[source]):
+                for connection in sorted(by_pair[source, target]):
+                    if not self._fits(arrows.get(connection.source_lane, frozenset()), source, target):
+                        yield connection
 
     def is_same_street(self, source: str, target: str) -> bool:
         """Return whether a turn leads back along the way that it comes from."""
@@ -393,14 +419,14 @@ def _mapped(way: Way, extract: OsmExtract) -> Way:
     return Way(way.id, tuple(node for node in way.nodes if node in extract.nodes), way.tags)
 
 
-def _arrows(tags: Tags, *, forward: bool) -> frozenset[str]:
-    """Return the arrows on the lanes of a way; empty if a lane has none, or an unknown one."""
+def _arrows(tags: Tags, *, forward: bool) -> list[frozenset[str]]:
+    """Return the arrows on each lane of a way, from left to right; empty for a lane without any, or an unknown one."""
     keys = ["turn:lanes:forward" if forward else "turn:lanes:backward"]
     if forward and directions(tags) == (True, False):
         keys.append("turn:lanes")
     text = next((tags[key] for key in keys if key in tags), "")
-    arrows = frozenset(arrow.strip() for lane in text.split("|") for arrow in lane.split(";"))
-    return arrows if arrows <= _ARROWS_DEG.keys() else frozenset()
+    lanes = [frozenset(arrow.strip() for arrow in lane.split(";")) for lane in text.split("|")]
+    return [lane if lane <= _ARROWS_DEG.keys() else frozenset() for lane in lanes]
 
 
 def _wrap_deg(angle_deg: float) -> float:
@@ -433,7 +459,7 @@ class StreetTurns:
     turns_back
         Permitted turns back to another street that the network lacks.
     off_arrows
-        Turns of the network that no restriction forbids, but that no arrow on the lanes allows.
+        Connections from lanes whose arrows mean other turns.
     """
 
     graph: StreetGraph
@@ -441,10 +467,10 @@ class StreetTurns:
     added: tuple[Pair, ...]
     relations: Mapping[Pair, frozenset[int]]
     turns_back: tuple[Pair, ...]
-    off_arrows: tuple[Pair, ...]
+    off_arrows: tuple[Connection, ...]
 
 
-def compare_with_map(extract: OsmExtract, network: Path) -> StreetTurns:
+def compare_with_map(extract: OsmExtract, network: Path, *, lefthand: bool = False) -> StreetTurns:
     """Compare the turns of a network with those of its map.
 
     Parameters
@@ -453,8 +479,10 @@ def compare_with_map(extract: OsmExtract, network: Path) -> StreetTurns:
         The map.
     network
         The network, made with :data:`ORIGINAL_NAMES_FLAG`.
+    lefthand
+        Whether traffic drives on the left.
     """
-    graph = StreetGraph(extract, network)
+    graph = StreetGraph(extract, network, lefthand=lefthand)
     for_cars: set[Pair] = set()
     for_any: set[Pair] = set()
     forth: set[Pair] = set()
@@ -473,9 +501,8 @@ def compare_with_map(extract: OsmExtract, network: Path) -> StreetTurns:
     comparison = compare_turns(for_cars & forth - off_arrows, built, for_any)
     relations = {pair: graph.forbidding(*pair) for pair in comparison.added}
     back = [pair for pair in sorted(for_cars - forth - built) if not graph.is_same_street(*pair)]
-    return StreetTurns(
-        graph, comparison.lost, comparison.added, relations, tuple(back), tuple(sorted(off_arrows & forth & built))
-    )
+    off_lanes = tuple(graph.connections_off_arrows())
+    return StreetTurns(graph, comparison.lost, comparison.added, relations, tuple(back), off_lanes)
 
 
 def repair_turns(
@@ -499,15 +526,15 @@ def repair_turns(
     tuple of str
         Sentences on what was repaired, and what still differs.
     """
-    before = after = compare_with_map(extract, folder / name)
+    before = after = compare_with_map(extract, folder / name, lefthand=lefthand)
     closed = _closable(before)
     if closed or before.lost:
         lanes = lanes_of_pairs(before.graph.built.connections)
         removed = [connection for pair in closed for connection in lanes[pair]]
-        added = [_connection(before.graph, pair, lefthand=lefthand) for pair in before.lost]
+        added = [_connection(before.graph, pair) for pair in before.lost]
         patch_network(folder, name, f"patched.{name}", removed=removed, added=added, flags=flags)
         (folder / f"patched.{name}").replace(folder / name)
-        after = compare_with_map(extract, folder / name)
+        after = compare_with_map(extract, folder / name, lefthand=lefthand)
     return tuple(_notes(before, after))
 
 
@@ -529,11 +556,11 @@ def _closable(turns: StreetTurns) -> list[Pair]:
     return closed
 
 
-def _connection(graph: StreetGraph, pair: Pair, *, lefthand: bool) -> Connection:
+def _connection(graph: StreetGraph, pair: Pair) -> Connection:
     """Return the connection of a turn: between the lanes on its side."""
     source, target = graph.edges[pair[0]], graph.edges[pair[1]]
     turned_deg = graph.turned_deg(*pair)
-    away_from_kerb = turned_deg < -_STRAIGHT_DEG if lefthand else turned_deg > _STRAIGHT_DEG
+    away_from_kerb = turned_deg < -_STRAIGHT_DEG if graph.lefthand else turned_deg > _STRAIGHT_DEG
     choose: Callable[[Sequence[int]], int] = max if away_from_kerb else min
     return Connection(source.id, choose(source.car_lanes), target.id, choose(target.car_lanes))
 
@@ -554,11 +581,9 @@ def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
             f" vehicles that wait to turn back block a street: {turns}."
         )
     if count := len(after.off_arrows):
-        turns = list_turns(graph.title(pair) for pair in after.off_arrows)
-        yield (
-            f"{number_of(count, 'turn')} of the network {by_number(count, 'has', 'have')} no arrow on the lanes of the"
-            f" map (turn:lanes): {turns}."
-        )
+        turns = list_turns(graph.title((lane.source, lane.target)) for lane in after.off_arrows)
+        verb = by_number(count, "does", "do")
+        yield f"{number_of(count, 'connection')} of lanes {verb} not follow the arrows of the map (turn:lanes): {turns}."
     yield from _restriction_notes(graph)
     if graph.unknown:
         edges = list_first(graph.unknown, MOST_LISTED)
