@@ -577,13 +577,13 @@ def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
     if count := len(after.turns_back):
         turns = list_turns(graph.title(pair) for pair in after.turns_back)
         yield (
-            f"{number_of(count, 'U-turn')} to another carriageway {by_number(count, 'is', 'are')} left out, since"
+            f"{number_of(count, 'U-turn')} (more than {U_TURN_DEG:g} degrees) {by_number(count, 'is', 'are')} left out, since"
             f" vehicles that wait to turn back block a street: {turns}."
         )
     if count := len(after.off_arrows):
         turns = list_turns(graph.title((lane.source, lane.target)) for lane in after.off_arrows)
-        verb = by_number(count, "does", "do")
-        yield f"{number_of(count, 'connection')} of lanes {verb} not follow the arrows of the map (turn:lanes): {turns}."
+        subject = f"{number_of(count, 'connection')} of lanes {by_number(count, 'does', 'do')}"
+        yield f"{subject} not follow the arrows of the map (turn:lanes): {turns}."
     yield from _restriction_notes(graph)
     if graph.unknown:
         edges = list_first(graph.unknown, MOST_LISTED)
