@@ -365,7 +365,10 @@ class StreetGraph:
         return not arrows or any(low <= turned_deg <= high for low, high in map(_ARROWS_DEG.__getitem__, arrows))
 
     def connections_off_arrows(self) -> Iterator[Connection]:
-        """Yield the connections from lanes whose arrows mean other turns, where a street leads to several others."""
+        """Yield the connections from lanes whose arrows mean other turns, where a street leads to several others.
+
+        At a fork, the arrows may be those of the next junction: then the leftmost and rightmost way are left and right.
+        """
         by_pair = lanes_of_pairs(self.built.connections)
         targets: dict[str, list[str]] = {}
         for source, target in by_pair:
@@ -378,9 +381,14 @@ class StreetGraph:
             if len(lanes) != len(edge.car_lanes):
                 continue
             arrows = dict(zip(edge.car_lanes, lanes if self.lefthand else lanes[::-1], strict=True))
+            by_angle = sorted(targets[source], key=lambda target: self.turned_deg(edge.id, target))
+            outer = {by_angle[0]: "right", by_angle[-1]: "left"}
             for target in sorted(targets[source]):
+                side = outer.get(target, "between")
                 for connection in sorted(by_pair[source, target]):
-                    if not self._fits(arrows.get(connection.source_lane, frozenset()), source, target):
+                    of_lane = arrows.get(connection.source_lane, frozenset())
+                    means_side = any(arrow.endswith(side) for arrow in of_lane)
+                    if not means_side and not self._fits(of_lane, source, target):
                         yield connection
 
     def is_same_street(self, source: str, target: str) -> bool:
