@@ -302,7 +302,8 @@ class StreetGraph:
                     if self.edges[target].from_node == edge.to_node:
                         yield MapTurn(edge.id, target, inside, for_cars)
                     continue
-                if after in self._on_edges or after == step.reverse:
+                passed = {node, self.start_node(step), *(self.start_node(other) for other in inside)}
+                if after in self._on_edges or self.end_node(after) in passed:  # a circle is no turn
                     continue
                 state = (after, following, for_cars and self._is_for_cars(after))
                 path = (*inside, after)
