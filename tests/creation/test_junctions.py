@@ -61,7 +61,7 @@ def test_street_that_merges_at_the_edge_of_the_region_brings_vehicles(tmp_path: 
     path = write_map(tmp_path / "map.osm", nodes, ways)
     extract = osm.read_osm(path)
     flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
-    _, streets = street_network.build_network(extract, path, flags)
+    _, streets, _ = street_network.build_network(extract, path, flags)
     x, y = next(j.at_m for j in streets.junctions if j.id == "2")
     flows = junctions.assumed_flows(streets, JunctionRegion((x, y), (60.0, 60.0)))
     edges = {edge.id: edge for edge in streets.network.edges}

@@ -61,7 +61,7 @@ def write_all_solids(folder: Path, extract: Path) -> None:
     """Replace the solids of a scenario by all solids of the extract."""
     read = osm.read_osm(extract)
     flags = street_network.netconvert_flags(read, lefthand=False, walk=False)
-    _, streets = street_network.build_network(read, extract, flags)
+    _, streets, _ = street_network.build_network(read, extract, flags)
     mapped, counts = osm_solids.map_solids(read, streets)
     solids = building_heights.heights_from_neighbours(mapped, counts, ())
     text = scenario_files.solids_geojson(solids, counts, (ATTRIBUTION,))

@@ -101,7 +101,7 @@ def test_region_and_sites_follow_the_hill(tmp_path: Path) -> None:
     assert heights_m == {3.0, 4.5, 6.0}
 
 
-@pytest.mark.parametrize("option", ["lefthand", "walk"])
+@pytest.mark.parametrize("option", ["lefthand", "righthand", "walk"])
 def test_network_has_its_own_side_and_sidewalks(tmp_path: Path, option: str) -> None:
     with pytest.raises(InputError, match=f"--{option}"):
         create_scenario(tmp_path / "made", ROUNDABOUT, **{option: True})

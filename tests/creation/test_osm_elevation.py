@@ -75,7 +75,7 @@ def test_network_has_the_heights_also_where_streets_are_cut(tmp_path: Path) -> N
     elevated = add_elevations(raw, read_elevations(raw).heights_m)
     cut = street_network.cut_surroundings(elevated, degrees((0.0, 0.0)), 170.0)
     flags = [*street_network.netconvert_flags(cut, lefthand=False, walk=False), *ELEVATION_FLAGS]
-    text, streets = street_network.build_network(cut, tmp_path / "map.osm", flags)
+    text, streets, _ = street_network.build_network(cut, tmp_path / "map.osm", flags)
     middle = np.array(streets.node_positions({5: degrees((0.0, 0.0))})[5])
     ends = []
     for shape in find_shapes(text):

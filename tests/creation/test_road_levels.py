@@ -82,7 +82,7 @@ def other_levels(path: Path) -> road_levels.OtherLevels:
     """Return what is above and below the junction at node 1."""
     extract = osm.read_osm(path)
     flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
-    _, streets = street_network.build_network(extract, path, flags)
+    _, streets, _ = street_network.build_network(extract, path, flags)
     junction = next(junction for junction in streets.junctions if junction.id == "1")
     return road_levels.find_other_levels(extract, streets, junction, junctions.region_around(junction).area)
 

@@ -29,7 +29,7 @@ def crossing() -> tuple[Streets, StreetJunction]:
     """North Street and East Street cross."""
     extract = osm.read_osm(SMALL)
     flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
-    _, streets = street_network.build_network(extract, SMALL, flags)
+    _, streets, _ = street_network.build_network(extract, SMALL, flags)
     junction = junctions.largest_junctions(streets)[0]
     assert junction is not None
     return streets, junction

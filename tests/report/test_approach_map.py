@@ -29,7 +29,7 @@ COUNTS = (
 def test_labels_name_side_street_and_vehicles_per_hour(tmp_path: Path) -> None:
     extract = osm.read_osm(SMALL)
     flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
-    network, streets = street_network.build_network(extract, SMALL, flags)
+    network, streets, _ = street_network.build_network(extract, SMALL, flags)
     (tmp_path / "network.net.xml").write_text(network)
     junction = junctions.largest_junctions(streets)[0]
     assert junction is not None

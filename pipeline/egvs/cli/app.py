@@ -611,7 +611,11 @@ def new(
             help="Overpass server for --download; default: EGVS_OVERPASS_URL, or overpass-api.de.",
         ),
     ] = None,
-    lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
+    lefthand: Annotated[
+        bool,
+        typer.Option("--lefthand", help="Traffic drives on the left; by default, the map and its position decide."),
+    ] = False,
+    righthand: Annotated[bool, typer.Option("--righthand", help="Traffic drives on the right.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
     surroundings: Annotated[
         str | None,
@@ -755,7 +759,8 @@ def new(
     if poles is not None:
         pole_spacing_m = cli_options.pole_spacing_m(*poles)
     options = NewScenarioOptions(
-        lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
+        lefthand=lefthand, righthand=righthand, walk=walk, surroundings_m=surroundings_m, traffic=demand,
+        pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
         tracks=tuple(tracks or ()), like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
         track_columns=track_columns, pedestrian_tracks=tuple(pedestrian_tracks or ()), counts=counts,

@@ -22,6 +22,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.creation import driving_side
 from egvs.creation.junctions import Streets
 from egvs.formats.georeference import HeightUnit, WorldFrame, height_unit, parse_crs
 from egvs.scenario.fields import MAX_COORDINATE_M
@@ -178,8 +179,9 @@ class RoadOptions:
 
     Attributes
     ----------
-    lefthand
-        Whether traffic drives on the left.
+    lefthand, righthand
+        Whether the user says that traffic drives on the left, or on the right; if neither, the map and its position
+        decide.
     walk
         Whether the network gets sidewalks and crossings.
     has_terrain
@@ -194,6 +196,12 @@ class RoadOptions:
     walk: bool = False
     has_terrain: bool = False
     at: tuple[float, float] | None = None
+    righthand: bool = False
+
+    @property
+    def requested_left(self) -> bool | None:
+        """Whether left-hand traffic was requested; None if nothing was."""
+        return driving_side.requested_left(lefthand=self.lefthand, righthand=self.righthand)
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,7 @@ from egvs.creation import (
 from egvs.creation.alignment import PointPair, check_used, make_alignment
 from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, NoTraffic
 from egvs.creation.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
+from egvs.creation.driving_side import requested_left
 from egvs.creation.junction_zones import Zone
 from egvs.creation.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.creation.map_parts import (
@@ -232,8 +233,8 @@ class NewScenarioOptions:
 
     Attributes
     ----------
-    lefthand
-        Whether traffic drives on the left.
+    lefthand, righthand
+        Whether traffic drives on the left, or on the right; by default, the map and its position decide.
     walk
         Whether the network gets sidewalks and crossings, which pedestrians need.
     surroundings_m
@@ -265,6 +266,7 @@ class NewScenarioOptions:
     """
 
     lefthand: bool = False
+    righthand: bool = False
     walk: bool = False
     surroundings_m: float | None = None
     traffic: str | int = DEFAULT_TRAFFIC
@@ -289,6 +291,7 @@ class NewScenarioOptions:
     def check(self) -> None:
         """Raise an InputError when a value is out of its limits, or no installed extension reads recordings."""
         assumed_traffic.check_traffic(self.traffic)
+        requested_left(lefthand=self.lefthand, righthand=self.righthand)
         self.recordings.check()
         _check_pole_spacing(self.pole_spacing_m)
         if self.tracks and self.like:
@@ -449,8 +452,9 @@ def _open_files(
 
 def _read_roads_and_recordings(draft: _Draft) -> None:
     """Read all roads of the map, and find the reader of each recording."""
-    options = RoadOptions(draft.options.lefthand, draft.options.walk, bool(draft.files.terrain), draft.at)
-    draft.map_roads = _read_roads(draft.files.roads, options)
+    options, has_terrain = draft.options, bool(draft.files.terrain)
+    road_options = RoadOptions(options.lefthand, options.walk, has_terrain, draft.at, options.righthand)
+    draft.map_roads = _read_roads(draft.files.roads, road_options)
     draft.recordings = new_traffic.find_recordings(draft.options.recordings)
 
 

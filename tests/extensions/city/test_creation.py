@@ -29,6 +29,8 @@ from egvs.stages import traffic
 from egvs.traffic import network
 from egvs.world import geolocation
 from tests.creation.new_scenarios import create_scenario
+from tests.creation.test_driving_side import ring_map
+from tests.creation.test_turn_restrictions import APART_M, divided_road
 from tests.stage_runner import run_stage
 
 pytestmark = pytest.mark.system
@@ -140,7 +142,7 @@ def read_solids(folder: Path) -> dict[str, dict]:
 
 def test_nearby_streets_give_same_poles_as_all_streets(extract: Path) -> None:
     read = osm.read_osm(extract)
-    _, streets = street_network.build_network(
+    _, streets, _ = street_network.build_network(
         read, extract, street_network.netconvert_flags(read, lefthand=False, walk=True)
     )
     for junction in streets.junctions:
@@ -152,7 +154,7 @@ def test_nearby_streets_give_same_poles_as_all_streets(extract: Path) -> None:
 
 def test_network_excerpt_keeps_streets(extract: Path, tmp_path: Path) -> None:
     read = osm.read_osm(extract)
-    text, streets = street_network.build_network(
+    text, streets, _ = street_network.build_network(
         read, extract, street_network.netconvert_flags(read, lefthand=False, walk=True)
     )
     excerpts, complete = network_excerpts.NetworkExcerpts(text), streets.network
@@ -392,3 +394,17 @@ def test_rejects_rows_of_junctions_that_no_line_divides(close_junctions: Path, t
     assert message.startswith(f"{table}: junctions small and large: no line divides their regions of interest")
     assert "Remove one of the two rows." in message
     assert not (tmp_path / "town").exists()
+
+
+def test_city_gets_the_side_and_the_turns_of_the_map(tmp_path: Path) -> None:
+    path = ring_map(tmp_path / "england.osm", 52.5, -1.5, clockwise=True)
+    city = creation.create_city(tmp_path / "city", path, NewCityOptions(which="all"))
+    assert 'lefthand="true"' in (tmp_path / "city" / "network.net.xml").read_text(encoding="utf-8")
+    assert city.notes[0].startswith("Traffic drives on the left: the one-way ring (way 1) runs clockwise")
+    with pytest.raises(InputError, match=r"england\.osm: is for left-hand traffic"):
+        creation.create_city(tmp_path / "other", path, NewCityOptions(which="all", righthand=True))
+    draft, ways = divided_road()
+    draft.restrict("no_left_turn", ways["middle"], draft.via((0.0, -APART_M)), ways["to east"])
+    street_network._write_streets(draft.extract(), tmp_path / "turns.osm")
+    city = creation.create_city(tmp_path / "turns", tmp_path / "turns.osm", NewCityOptions(which="all"))
+    assert any(note.startswith("1 turn that the map does not permit was closed") for note in city.notes)

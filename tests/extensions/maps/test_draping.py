@@ -179,7 +179,7 @@ def test_bridge_of_a_map_is_an_edge_of_its_own(tmp_path: Path) -> None:
     merged = street_network.build_network(extract, tmp_path / "map.osm", flags)[1].network.edges
     assert not road_levels.edge_levels([edge.id for edge in merged], extract)
     flags += road_levels.keep_levels_flags(extract)
-    text, streets = street_network.build_network(extract, tmp_path / "map.osm", flags)
+    text, streets, _ = street_network.build_network(extract, tmp_path / "map.osm", flags)
     levels = road_levels.edge_levels([edge.id for edge in streets.network.edges], extract)
     assert levels == {"2": 1, "-2": 1}
     west_m = np.array(streets.node_positions({1: degrees((0.0, 0.0))})[1])

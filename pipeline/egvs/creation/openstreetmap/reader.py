@@ -21,6 +21,7 @@ from egvs.creation.map_parts import ImportCounts, MapContext, MappedSolid, RoadO
 from egvs.creation.openstreetmap import ATTRIBUTION, elevation
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
+from egvs.creation.openstreetmap.side_evidence import choose_map_side, exceptions_note
 from egvs.creation.road_levels import OtherLevels
 from egvs.formats import osm as osm_files
 from egvs.formats.osm import OsmExtract
@@ -57,6 +58,8 @@ class OsmRoads:
         The network, as text and read.
     others
         Ways on other levels than the junction.
+    map_notes, turn_notes
+        Sentences for the user about the map, and about the turns of the network.
     """
 
     extract: OsmExtract
@@ -66,7 +69,8 @@ class OsmRoads:
     streets: Streets
     others: OtherLevels = _ONE_LEVEL
     attribution: str = ATTRIBUTION
-    notes: tuple[str, ...] = ()
+    map_notes: tuple[str, ...] = ()
+    turn_notes: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, path: Path, options: RoadOptions) -> OsmRoads:
@@ -82,23 +86,30 @@ class OsmRoads:
         Raises
         ------
         InputError
-            When the file is damaged or has no drivable streets, or the position is outside.
+            When the file is damaged or has no drivable streets, the position is outside, or the side of traffic is
+            unclear.
         """
         extract = osm_files.read_osm(path)
         check_inside_extract(extract, options.at)
-        flags = osm_network.netconvert_flags(extract, lefthand=options.lefthand, walk=options.walk)
-        notes: tuple[str, ...] = ()
+        side = choose_map_side(extract, options.requested_left, options.at, str(path))
+        flags = osm_network.netconvert_flags(extract, lefthand=side.lefthand, walk=options.walk)
+        notes = side.note, *exceptions_note(extract, lefthand=side.lefthand)
         if options.has_terrain:
             flags += road_levels.keep_levels_flags(extract)
         else:
             elevations = elevation.read_elevations(extract)
             if elevations.note:
-                notes = (elevations.note,)
+                notes = *notes, elevations.note
             if elevations.heights_m:
                 extract = elevation.add_elevations(extract, elevations.heights_m)
                 flags += elevation.ELEVATION_FLAGS
-        network, streets = osm_network.build_network(extract, path, flags)
-        return cls(extract, path, tuple(flags), network, streets, notes=notes)
+        network, streets, turn_notes = osm_network.build_network(extract, path, flags)
+        return cls(extract, path, tuple(flags), network, streets, map_notes=notes, turn_notes=turn_notes)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user about the map, and about the turns of the network."""
+        return (*self.map_notes, *self.turn_notes)
 
     @property
     def keeps_heights(self) -> bool:
@@ -120,18 +131,18 @@ class OsmRoads:
         if not others.roads:
             return replace(self, others=others)
         extract = osm_network.cut_out_roads(self.extract, self.streets, others.roads, window)
-        network, streets = osm_network.build_network(extract, self.path, self.flags)
-        return replace(self, extract=extract, network=network, streets=streets, others=others)
+        network, streets, notes = osm_network.build_network(extract, self.path, self.flags)
+        return replace(self, extract=extract, network=network, streets=streets, others=others, turn_notes=notes)
 
     def around(self, junction: StreetJunction, radius_m: float | None) -> OsmRoads:
         """Return the roads within a radius of a junction, in the same frame; :data:`SURROUNDINGS_M` if it is None."""
         radius_m = SURROUNDINGS_M if radius_m is None else radius_m
         if math.isinf(radius_m):
             return self
-        network, streets = osm_network.crop_network(
+        network, streets, notes = osm_network.crop_network(
             self.extract, self.path, self.flags, self.streets, junction, radius_m
         )  # fmt: skip
-        return replace(self, network=network, streets=streets)
+        return replace(self, network=network, streets=streets, turn_notes=notes)
 
     def edge_levels(self) -> dict[str, int]:
         """Return the levels of the edges that are not on the ground: bridges and tunnels."""

@@ -14,10 +14,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 from shapely.geometry import LineString
 from shapely.geometry.base import BaseGeometry
@@ -27,7 +28,8 @@ from egvs.core.errors import InputError, RunError
 from egvs.core.grid import XY
 from egvs.creation import junctions
 from egvs.creation.junctions import StreetJunction, Streets
-from egvs.creation.openstreetmap import ATTRIBUTION
+from egvs.creation.openstreetmap import ATTRIBUTION, street_turns
+from egvs.creation.openstreetmap.restrictions import restrictions_of_pieces
 from egvs.creation.plain_network import NETWORK_FILE
 from egvs.formats import xml
 from egvs.formats.osm import OsmExtract, Way, parse_number
@@ -46,6 +48,13 @@ The last two prevent locks: vehicles turn back at dead ends only, since one that
 street blocks all behind it; and a minor street gives way by a sign, since four vehicles that give way to each other
 from the right wait forever.
 """
+
+REPAIR_FLAGS = (
+    "--tls.rebuild", "--tls.default-type", "actuated", "--default.connection.cont-pos", "0",
+    "--no-turnarounds.except-deadend", "--junctions.right-before-left.speed-threshold", "0",
+    "--offset.disable-normalization", "--output.street-names", "--precision", "3", street_turns.ORIGINAL_NAMES_FLAG,
+)  # fmt: skip
+"""How netconvert reads and writes a network whose turns are repaired: all other parts stay the same."""
 
 JOINED_SIGNALS_FLAG = "--tls.join"
 LONGEST_PROGRAM_S = 120.0
@@ -96,10 +105,28 @@ def netconvert_flags(extract: OsmExtract, *, lefthand: bool, walk: bool) -> list
     return flags
 
 
+class StreetNetwork(NamedTuple):
+    """A SUMO network of streets.
+
+    Attributes
+    ----------
+    text
+        The network.
+    streets
+        The same network, read.
+    notes
+        Sentences for the user about its turns.
+    """
+
+    text: str
+    streets: Streets
+    notes: tuple[str, ...]
+
+
 def build_network(
     extract: OsmExtract, osm: Path, flags: Sequence[str], frame: Location | None = None, radius_m: float | None = None
-) -> tuple[str, Streets]:
-    """Run netconvert on the streets of an extract.
+) -> StreetNetwork:
+    """Run netconvert on the streets of an extract, and repair its turns.
 
     Parameters
     ----------
@@ -114,13 +141,6 @@ def build_network(
         The frame of the network; by default, netconvert chooses one.
     radius_m
         Distance at which the streets of a larger extract were cut, for messages.
-
-    Returns
-    -------
-    text : str
-        The SUMO network.
-    streets : Streets
-        The same network, read.
 
     Raises
     ------
@@ -142,10 +162,12 @@ def build_network(
         _write_streets(extract, folder / "streets.osm.xml")
         try:
             arguments = ["--osm-files", "streets.osm.xml", *flags, *_frame_flags(frame)]
-            sumo.run_netconvert(arguments, folder, NETWORK_FILE)
+            notes = _convert(extract, arguments, folder)
             if JOINED_SIGNALS_FLAG in arguments and longest_program_s(folder / NETWORK_FILE) > LONGEST_PROGRAM_S:
                 arguments.remove(JOINED_SIGNALS_FLAG)
-                sumo.run_netconvert(arguments, folder, NETWORK_FILE)
+                notes = _convert(extract, arguments, folder)
+            text = street_turns.strip_origins((folder / NETWORK_FILE).read_text(encoding="utf-8"))
+            files.write_text(folder / NETWORK_FILE, text)
             if frame is not None:
                 _state_offset(folder / NETWORK_FILE, frame)
             streets = junctions.read_streets(folder / NETWORK_FILE)
@@ -160,7 +182,14 @@ def build_network(
 
     # the first comment of netconvert contains the date and paths
     text = re.sub(r"<!-- generated on .*?-->", f"<!-- {ATTRIBUTION} -->", text, count=1, flags=re.DOTALL)
-    return text, streets
+    return StreetNetwork(text, streets, notes)
+
+
+def _convert(extract: OsmExtract, arguments: Sequence[str], folder: Path) -> tuple[str, ...]:
+    """Run netconvert, and repair the turns of its network; return notes."""
+    sumo.run_netconvert([*arguments, street_turns.ORIGINAL_NAMES_FLAG], folder, NETWORK_FILE)
+    lefthand = "--lefthand" in arguments
+    return street_turns.repair_turns(extract, folder, NETWORK_FILE, REPAIR_FLAGS, lefthand=lefthand)
 
 
 def longest_program_s(path: Path) -> float:
@@ -177,7 +206,7 @@ def longest_program_s(path: Path) -> float:
 
 def crop_network(
     extract: OsmExtract, osm: Path, flags: Sequence[str], streets: Streets, junction: StreetJunction, radius_m: float
-) -> tuple[str, Streets]:
+) -> StreetNetwork:
     """Build the network around a junction, in the frame of the complete network.
 
     Parameters
@@ -190,13 +219,6 @@ def crop_network(
         The junction in the middle.
     radius_m
         Distance at which streets end.
-
-    Returns
-    -------
-    text : str
-        The SUMO network.
-    streets : Streets
-        The same network, read.
     """
     location = streets.network.location
     assert location is not None, "netconvert writes a location"
@@ -242,6 +264,7 @@ def cut_surroundings(extract: OsmExtract, middle: tuple[float, float], radius_m:
     """
     circle = _Circle(extract, middle, radius_m)
     ways: dict[int, Way] = {}
+    cut: dict[int, Collection[Way]] = {}
     next_id = max(extract.ways) + 1
     for way in extract.ways.values():
         if "highway" not in way.tags:
@@ -250,9 +273,16 @@ def cut_surroundings(extract: OsmExtract, middle: tuple[float, float], radius_m:
         pieces = _pieces_as_ways(way, _pieces_inside(way, circle, extract), next_id)
         next_id += max(0, len(pieces) - 1)
         ways |= pieces
+        cut[way.id] = pieces.values()
 
     node_tags = dict(sorted((extract.node_tags | circle.cut_tags).items()))
-    inside = replace(extract, nodes=extract.nodes | circle.cuts, node_tags=node_tags, ways=dict(sorted(ways.items())))
+    inside = replace(
+        extract,
+        nodes=extract.nodes | circle.cuts,
+        node_tags=node_tags,
+        ways=dict(sorted(ways.items())),
+        relations=restrictions_of_pieces(extract.relations, cut, extract.ways),
+    )
     connected = _connected_roads(inside, circle)
     return replace(inside, ways={i: way for i, way in inside.ways.items() if i in connected or not is_road(way)})
 
@@ -273,13 +303,16 @@ def cut_out_roads(extract: OsmExtract, streets: Streets, roads: Sequence[Way], r
     """
     xy = streets.node_positions(extract.nodes)
     ways = dict(extract.ways)
+    cut: dict[int, Collection[Way]] = {}
     next_id = max(ways) + 1
     for road in roads:
         del ways[road.id]
         pieces = _pieces_as_ways(road, _pieces_outside(road, xy, region), next_id)
         next_id += max(0, len(pieces) - 1)
         ways |= pieces
-    return replace(extract, ways=dict(sorted(ways.items())))
+        cut[road.id] = pieces.values()
+    relations = restrictions_of_pieces(extract.relations, cut, extract.ways)
+    return replace(extract, ways=dict(sorted(ways.items())), relations=relations)
 
 
 def _pieces_outside(way: Way, xy: Mapping[int, XY], region: BaseGeometry) -> Iterator[tuple[int, ...]]:
@@ -297,7 +330,7 @@ def _pieces_outside(way: Way, xy: Mapping[int, XY], region: BaseGeometry) -> Ite
 def _pieces_as_ways(way: Way, pieces: Iterable[tuple[int, ...]], next_id: int) -> dict[int, Way]:
     """Make ways of the pieces of a way that have at least two nodes.
 
-    The longest keeps the identifier, which turn restrictions refer to; the others are numbered from ``next_id``.
+    The longest keeps the identifier; the others are numbered from ``next_id``.
     """
     longest_first = sorted((piece for piece in pieces if len(piece) > 1), key=len, reverse=True)
     ids = [way.id, *range(next_id, next_id + len(longest_first))]

@@ -72,7 +72,11 @@ def new(
             metavar="WHICH", help="signalised, all, or a CSV table with the columns junction, lat_deg, lon_deg."
         ),
     ] = "signalised",
-    lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
+    lefthand: Annotated[
+        bool,
+        typer.Option("--lefthand", help="Traffic drives on the left; by default, the map and its position decide."),
+    ] = False,
+    righthand: Annotated[bool, typer.Option("--righthand", help="Traffic drives on the right.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
     traffic: Annotated[
         str,
@@ -92,7 +96,9 @@ def new(
     with ProgressDisplay("city") as screen:
         from egvs.extensions.city import creation, new_summary
 
-        new_options = creation.NewCityOptions(centre, radius_m, junctions, lefthand, walk, traffic, screen.progress)
+        new_options = creation.NewCityOptions(
+            centre, radius_m, junctions, lefthand, walk, traffic, screen.progress, righthand
+        )  # fmt: skip
         created = creation.create_city(folder, osm, new_options)
     new_summary.print_new_city(created)
 

@@ -33,12 +33,14 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import format_percent
 from egvs.creation import assumed_traffic, junctions, new_scenario, scenario_files
 from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, TRAFFIC_LEVELS
+from egvs.creation.driving_side import requested_left
 from egvs.creation.junctions import HEIGHTS_M, JunctionRegion, KerbsidePole, NearbyJunction, StreetJunction, Streets
 from egvs.creation.map_parts import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap import ATTRIBUTION
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
 from egvs.creation.openstreetmap.reader import check_inside_extract
+from egvs.creation.openstreetmap.side_evidence import choose_map_side, exceptions_note
 from egvs.creation.plain_network import NETWORK_FILE
 from egvs.creation.scenario_files import PITCHES_DEG, SITES_FILE, STATICS_FILE, TomlTable, reachable_area
 from egvs.extensions.city import model
@@ -187,7 +189,7 @@ class NewCityOptions:
         ``around`` is None.
     which
         ``"signalised"``, ``"all"``, or the path of a table, see :func:`choose_junctions`.
-    lefthand, walk
+    lefthand, righthand, walk
         As in :func:`egvs.creation.new_scenario.NewScenarioOptions`.
     traffic
         A key of :data:`egvs.creation.assumed_traffic.TRAFFIC_LEVELS`: the share of the flow that the network carries.
@@ -202,6 +204,7 @@ class NewCityOptions:
     walk: bool = False
     traffic: str = DEFAULT_TRAFFIC
     progress: ProgressCallback = no_progress
+    righthand: bool = False
 
 
 def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) -> NewCity:
@@ -220,11 +223,13 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     ------
     InputError
         When the folder is not empty, the file is damaged or has no drivable streets, ``around`` is outside the extract,
-        a table is wrong or selects junctions with overlapping regions, or no junction is left. Nothing is written then.
+        the side of traffic is unclear, a table is wrong or selects junctions with overlapping regions, or no junction
+        is left. Nothing is written then.
     """
     options = options or NewCityOptions()
     around, radius_m, which = options.around, options.radius_m, options.which
     assumed_traffic.check_traffic_level(options.traffic)
+    side_option = requested_left(lefthand=options.lefthand, righthand=options.righthand)
     name = scenario_files.check_new_folder(folder)
     if radius_m is not None and around is None:
         raise InputError("--radius", "given without --around", "Add --around LAT,LON.")
@@ -234,8 +239,9 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     street_extract, rim_m = extract, radius_m or DEFAULT_RADIUS_M
     if around is not None:
         street_extract = osm_network.cut_surroundings(extract, around, rim_m)
-    flags = osm_network.netconvert_flags(extract, lefthand=options.lefthand, walk=options.walk)
-    network, streets = osm_network.build_network(street_extract, osm, flags)
+    side = choose_map_side(extract, side_option, around, str(osm))
+    flags = osm_network.netconvert_flags(extract, lefthand=side.lefthand, walk=options.walk)
+    network, streets, turn_notes = osm_network.build_network(street_extract, osm, flags)
     within = None
     if around is not None:
         within = Point(streets.to_xy([around[1]], [around[0]])[0]).buffer(rim_m - RIM_WIDTH_M)
@@ -266,7 +272,8 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
         raise InputError(osm, f"no junction is left ({reasons})", hint)
 
     flow = CityFlow(find_flow(network, JUNCTION_BLOCKER_S), options.traffic)
-    notes = _import_notes(made, counts, flow, options.walk)
+    side_notes = side.note, *exceptions_note(extract, lefthand=side.lefthand)
+    notes = (*side_notes, *turn_notes, *_import_notes(made, counts, flow, options.walk))
     city = NewCity(folder, tuple(made), left_out, streets, counts, flow, notes)
     scenario_files.publish_folder(folder, _city_files(city, name, network, solids, areas), _check_city)
     return city

@@ -222,8 +222,8 @@ class Road:
         Length of its reference line.
     junction
         Id of the junction that it leads through; empty for a road between junctions.
-    lefthand
-        Whether traffic keeps to the left.
+    rule
+        ``"LHT"`` where traffic keeps to the left, ``"RHT"`` to the right; empty if the file does not say.
     predecessor, successor
         What is at its ends.
     plan
@@ -240,7 +240,7 @@ class Road:
     name: str
     length_m: float
     junction: str
-    lefthand: bool
+    rule: str
     predecessor: Link | None
     successor: Link | None
     plan: tuple[PlanElement, ...]
@@ -431,7 +431,7 @@ def _parse_road(element: Element) -> Road:
         name=element.get("name", ""),
         length_m=length_m,
         junction="" if junction == "-1" else junction,
-        lefthand=element.get("rule", "RHT").upper() == "LHT",
+        rule=element.get("rule", "").upper(),
         predecessor=_parse_link(element.find("link/predecessor")),
         successor=_parse_link(element.find("link/successor")),
         plan=plan,

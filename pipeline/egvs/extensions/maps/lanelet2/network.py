@@ -21,6 +21,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import number_of
 from egvs.creation.plain_network import NETWORK_FILE
+from egvs.creation.turns import Connection, TurnComparison, compare_turns
 from egvs.extensions.maps.formats.lanelet2 import LaneletMap
 from egvs.extensions.maps.lane_changes import NO_CHANGE
 from egvs.extensions.maps.lanelet2 import rules
@@ -68,16 +69,15 @@ class NetworkQuality:
         Largest distance of a lane from that of the map.
     bad_lanes
         Lanes that are more than :data:`MAX_LANE_ERROR_M` off, as ``road_lane``.
-    lost, added
-        Connections that netconvert dropped or invented, as ``road_lane -> road_lane``.
+    turns
+        Connections that netconvert dropped or invented.
     lost_crossings
         Crosswalks that netconvert cannot build.
     """
 
     max_lane_error_m: float = 0.0
     bad_lanes: list[str] = field(default_factory=list)
-    lost: list[str] = field(default_factory=list)
-    added: list[str] = field(default_factory=list)
+    turns: TurnComparison[Connection] = field(default_factory=lambda: TurnComparison((), ()))
     lost_crossings: list[Crosswalk] = field(default_factory=list)
 
 
@@ -270,8 +270,8 @@ class NetworkBuilder:
                 if error_m > MAX_LANE_ERROR_M
             }
             bad_nodes |= at_ends or {road.start, road.end}
-        wanted = {
-            (
+        permitted = {
+            Connection(
                 turn.source,
                 sumo_lane(turn.source, turn.source_lane),
                 turn.target,
@@ -280,9 +280,10 @@ class NetworkBuilder:
             for turn in self._layout.turns
         }
         edges = actual.edges
-        built = {(edges[c.source].id, c.source_lane, edges[c.target].id, c.target_lane) for c in actual.connections}
-        quality.lost = [_describe_turn(turn) for turn in sorted(wanted - built)]
-        quality.added = [_describe_turn(turn) for turn in sorted(built - wanted)]
+        built = {
+            Connection(edges[c.source].id, c.source_lane, edges[c.target].id, c.target_lane) for c in actual.connections
+        }
+        quality.turns = compare_turns(permitted, built)
         return quality, bad_nodes
 
 
@@ -343,10 +344,6 @@ def _has_ring(roads: Set[tuple[str, str]]) -> bool:
         if inner == one_way:
             return bool(inner)
         one_way = inner
-
-
-def _describe_turn(turn: tuple[str, int, str, int]) -> str:
-    return f"{turn[0]}_{turn[1]} -> {turn[2]}_{turn[3]}"
 
 
 def unused_relations(layout: RoadLayout) -> list[tuple[str, str]]:

@@ -12,12 +12,16 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from egvs.core import polylines
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import translate_errors
 from egvs.core.wording import number_of
+from egvs.creation.driving_side import side_in_frame
 from egvs.creation.map_parts import RoadMap, RoadOptions
+from egvs.creation.turns import turn_notes
 from egvs.extensions.maps.formats.lanelet2 import LaneletMap, is_lanelet2, read_lanelet2
 from egvs.extensions.maps.formats.lanelet2_graph import (
     DirectedLanelet,
@@ -55,8 +59,8 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     path
         An ``.osm`` file, plain or gzipped; a ``map_projector_info.yaml`` beside it is used.
     options
-        ``lefthand`` is needed only where no opposite lanes tell the driving side. With ``walk``, crosswalks become
-        crossings, and the roads at their junctions get sidewalks.
+        ``lefthand`` is needed only where neither opposite lanes nor the position tell the side of traffic. With
+        ``walk``, crosswalks become crossings, and the roads at their junctions get sidewalks.
 
     Raises
     ------
@@ -71,23 +75,26 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     if not graph.lanelets:
         raise InputError(path, "has no lanelets for motor vehicles", _NO_ROADS_HINT)
     with translate_errors(path, "Correct the map in an editor.", "its lanelets cannot be made into roads"):
-        lefthand, side_notes = rules.choose_driving_side(graph, options.lefthand, str(path))
+        middle_m = np.mean(list(points.xyz_m.values()), axis=0)
+        side = rules.choose_driving_side(
+            graph, options.requested_left, side_in_frame(points.frame, middle_m), str(path)
+        )
         crosswalk_lanelets = _crosswalks(lanelet_map, points.xyz_m) if options.walk else []
-        layout = make_roads(graph, lefthand=lefthand, crosswalks=crosswalk_lanelets)
+        layout = make_roads(graph, lefthand=side.lefthand, crosswalks=crosswalk_lanelets)
         if not layout.roads:
             problem = "none of its lanelets can be a road: all overlap others and have neither beginning nor end"
             raise InputError(path, problem, "Correct the map in an editor.")
         crosswalks, unused_crosswalks = place_crosswalks(layout, crosswalk_lanelets)
-        builder = _make_builder(layout, lanelet_map, points, crosswalks, str(path), lefthand)
+        builder = _make_builder(layout, lanelet_map, points, crosswalks, str(path), side.lefthand)
         network, quality = builder.build()
         lost_crossings = quality.lost_crossings
         if lost_crossings:
             crosswalks = tuple(crosswalk for crosswalk in crosswalks if crosswalk not in lost_crossings)
-            builder = _make_builder(layout, lanelet_map, points, crosswalks, str(path), lefthand)
+            builder = _make_builder(layout, lanelet_map, points, crosswalks, str(path), side.lefthand)
             network, quality = builder.build()
     notes = (
         *points.notes,
-        *side_notes,
+        side.note,
         *_content_notes(lanelet_map, graph, layout),
         *(_crosswalk_notes(crosswalks, unused_crosswalks, lost_crossings) if options.walk else ()),
         *_assumption_notes(builder.assumed),
@@ -246,9 +253,7 @@ def _quality_notes(quality: NetworkQuality, opened: Sequence[tuple[str, int]]) -
     yield f"Lanes are at most {quality.max_lane_error_m:.2f} m from the centre lines of the lanelets."
     if quality.bad_lanes:
         yield f"Lanes more than {MAX_LANE_ERROR_M:g} m off: {_count(quality.bad_lanes)}."
-    for what, turns in (("dropped", quality.lost), ("added", quality.added)):
-        if turns:
-            yield f"Connections that netconvert {what}: {_count(turns)}."
+    yield from turn_notes(lost=list(map(str, quality.turns.lost)), added=list(map(str, quality.turns.added)))
     if opened:
         lanes = [f"{road}_{index}" for road, index in opened]
         yield (

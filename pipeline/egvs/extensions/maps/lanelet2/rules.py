@@ -15,6 +15,7 @@ import shapely
 from shapely.geometry import LineString, Point
 
 from egvs.core.errors import InputError
+from egvs.creation.driving_side import DrivingSide, Evidence, choose_side, majority
 from egvs.extensions.maps.formats.lanelet2 import Lanelet, LaneletMap
 from egvs.extensions.maps.formats.lanelet2_graph import MOTOR_VEHICLES, DirectedLanelet, LaneletGraph, allowed_users
 from egvs.formats.osm import Tags, Way
@@ -53,7 +54,6 @@ _SPEED_HINT = "Give a speed such as 50, 50 km/h or 13.9 m/s."
 _DASHED_TYPES = ("line_thin", "line_thick")
 _SIDE_RANGE_M, _SIDE_MIN_M = 25.0, 1.5
 _OPPOSITE = -0.8
-_CLEAR_MAJORITY = 0.8
 
 
 @dataclass
@@ -214,28 +214,21 @@ def opposite_sides_m(graph: LaneletGraph) -> tuple[float, float]:
     return left_m, right_m
 
 
-def choose_driving_side(graph: LaneletGraph, requested_left: bool, where: str) -> tuple[bool, list[str]]:
-    """Return whether traffic drives on the left, and notes.
-
-    Where opposite lanes lie mostly on one side, they tell. Otherwise the request counts.
+def choose_driving_side(
+    graph: LaneletGraph, lefthand: bool | None, of_position: Evidence | None, where: str
+) -> DrivingSide:
+    """Decide on which side traffic drives: as opposite lanes lie to each other, or else as requested, or as at the
+    map's position.
 
     Raises
     ------
     InputError
-        When left-hand traffic is requested, and opposite lanes lie on the left.
+        When opposite lanes contradict the request.
     """
     left_m, right_m = opposite_sides_m(graph)
-    known_m = left_m + right_m
-    if known_m and max(left_m, right_m) >= _CLEAR_MAJORITY * known_m:
-        drives_left = right_m > left_m
-        if requested_left and not drives_left:
-            problem = "opposite lanes lie to the left of each other, so traffic drives on the right"
-            raise InputError(where, problem, "Leave out --lefthand.")
-        if drives_left and not requested_left:
-            return True, ["Traffic drives on the left: opposite lanes lie to the right of each other."]
-        return drives_left, []
-    side = "left" if requested_left else "right"
-    return requested_left, [f"Traffic drives on the {side}, as requested; the map's opposite lanes do not tell."]
+    reasons = "opposite lanes lie to the right of each other", "opposite lanes lie to the left of each other"
+    evidence = majority(right_m, left_m, reasons)
+    return choose_side(lefthand, [] if evidence is None else [evidence], of_position, where)
 
 
 def _nearest_piece(lanelet: DirectedLanelet, at_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

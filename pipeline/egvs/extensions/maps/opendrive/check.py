@@ -9,7 +9,7 @@ World frame of the network: x, y of the map plus the network's ``netOffset`` and
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -18,6 +18,7 @@ import numpy as np
 import shapely
 
 from egvs.core.grid import FloatArray
+from egvs.creation.turns import BuiltTurns, Connection, compare_turns
 from egvs.extensions.maps.formats.opendrive import OpenDriveMap
 from egvs.extensions.maps.opendrive.turns import DRIVING_TYPES, LaneKey, Turn, driving_lanes, permitted_turns
 from egvs.formats import xml
@@ -66,8 +67,8 @@ class MadeNetwork:
     ----------
     lanes
         Lanes by road and lane of the map.
-    connections
-        (edge, lane, edge, lane).
+    turns
+        Its connections.
     signal_roads
         Roads with a lane that leads to a traffic light.
     signal_nodes
@@ -77,10 +78,15 @@ class MadeNetwork:
     """
 
     lanes: Mapping[tuple[str, int], tuple[NetworkLane, ...]]
-    connections: frozenset[tuple[str, int, str, int]]
+    turns: BuiltTurns
     signal_roads: frozenset[str]
     signal_nodes: frozenset[str]
     offset_m: tuple[float, float]
+
+    @property
+    def connections(self) -> Set[Connection]:
+        """Its connections, without U-turns."""
+        return self.turns.connections - self.turns.u_turns
 
 
 @dataclass(frozen=True)
@@ -128,11 +134,12 @@ def read_made_network(path: Path) -> MadeNetwork:
     """Read a network that netconvert made with ``--output.original-names``."""
     lanes: dict[tuple[str, int], list[NetworkLane]] = {}
     road_of_edge: dict[str, set[str]] = {}
-    connections = set()
+    turns = BuiltTurns()
     signalised_edges = set()
     signal_nodes = set()
     offset_m = (0.0, 0.0)
     for element in xml.iter_elements(path, "net"):
+        turns.add(element)
         if element.tag == "location":
             x, y = map(float, element.attrib["netOffset"].split(",")[:2])
             offset_m = (x, y)
@@ -145,16 +152,12 @@ def read_made_network(path: Path) -> MadeNetwork:
                     road, _, number = origin.rpartition("_")
                     lanes.setdefault((road, int(number)), []).append(made)
                     road_of_edge.setdefault(edge, set()).add(road)
-        elif element.tag == "connection" and not element.attrib["from"].startswith(":"):
-            source, target = element.attrib["from"], element.attrib["to"]
-            if not target.startswith(":") and element.get("dir") not in ("t", "T"):
-                connections.add((source, int(element.attrib["fromLane"]), target, int(element.attrib["toLane"])))
-            if "tl" in element.attrib:
-                signalised_edges.add(source)
-                signal_nodes.add(element.attrib["tl"])
+        elif element.tag == "connection" and "tl" in element.attrib and not element.attrib["from"].startswith(":"):
+            signalised_edges.add(element.attrib["from"])
+            signal_nodes.add(element.attrib["tl"])
     signal_roads = {road for edge in signalised_edges for road in road_of_edge.get(edge, ())}
     by_origin = {key: tuple(made) for key, made in lanes.items()}
-    return MadeNetwork(by_origin, frozenset(connections), frozenset(signal_roads), frozenset(signal_nodes), offset_m)
+    return MadeNetwork(by_origin, turns, frozenset(signal_roads), frozenset(signal_nodes), offset_m)
 
 
 def compare_with_map(made: MadeNetwork, road_map: OpenDriveMap, *, mirrored: bool) -> MapComparison:
@@ -172,20 +175,25 @@ def compare_with_map(made: MadeNetwork, road_map: OpenDriveMap, *, mirrored: boo
     lines = _lane_lines(road_map, made.offset_m, mirrored)
     lost = tuple(key for key in lines if not _candidates_near(made, key, lines[key]))
     turns = permitted_turns(road_map)
-    missing: dict[Turn, tuple[NetworkLane, NetworkLane]] = {}
+    ends: dict[Turn, tuple[NetworkLane, NetworkLane]] = {}
+    connections: dict[Turn, Connection] = {}
     lost_turns = []
-    permitted = set()
     for turn in turns:
         source = _lane_at(made, turn.source, _end_point(lines, turn.source), -1)
         target = _lane_at(made, turn.target, _start_point(lines, turn.target), 0)
         if source is None or target is None:
             lost_turns.append(turn)
             continue
-        connection = (source.edge, source.index, target.edge, target.index)
-        permitted.add(connection)
-        if source is not target and connection not in made.connections:
-            missing[turn] = source, target
-    others = sorted(_added(made, permitted))
+        ends[turn] = source, target
+        connections[turn] = Connection(source.edge, source.index, target.edge, target.index)
+    permitted = set(connections.values())
+    comparison = compare_turns(permitted, made.connections, _within_lanes(made))
+    lost_connections = set(comparison.lost)
+    missing = {
+        turn: ends[turn]
+        for turn, connection in connections.items()
+        if connection in lost_connections and ends[turn][0] is not ends[turn][1]
+    }
     linked = {connection[:2] for connection in permitted}
     off_m, height_off_m = _distances(made, lines)
     return MapComparison(
@@ -194,8 +202,8 @@ def compare_with_map(made: MadeNetwork, road_map: OpenDriveMap, *, mirrored: boo
         turns=len(turns),
         missing=missing,
         lost_turns=tuple(lost_turns),
-        added=tuple(connection for connection in others if connection[:2] in linked),
-        guessed=tuple(connection for connection in others if connection[:2] not in linked),
+        added=tuple(connection for connection in comparison.added if connection[:2] in linked),
+        guessed=tuple(connection for connection in comparison.added if connection[:2] not in linked),
         off_m=off_m,
         height_off_m=height_off_m,
         unlit_roads=tuple(_unlit_roads(made, road_map)),
@@ -252,16 +260,16 @@ def _driving_lanes(made: MadeNetwork) -> Iterator[NetworkLane]:
         yield from (lane for lane in lanes if lane.type in DRIVING_TYPES)
 
 
-def _added(made: MadeNetwork, permitted: Iterable[tuple[str, int, str, int]]) -> Iterator[tuple[str, int, str, int]]:
-    """Yield the connections for vehicles that are no permitted turn, and no joint of two pieces of one lane."""
+def _within_lanes(made: MadeNetwork) -> Iterator[Connection]:
+    """Yield the connections that are joints of two pieces of one lane of the map, or not for vehicles."""
     origin = {}
     for key, lanes in made.lanes.items():
         for lane in lanes:
             if lane.type in DRIVING_TYPES:
                 origin[lane.edge, lane.index] = key
-    for connection in made.connections - set(permitted):
+    for connection in made.connections:
         source, target = origin.get(connection[:2]), origin.get(connection[2:])
-        if source is not None and target is not None and source != target:
+        if source is None or target is None or source == target:
             yield connection
 
 

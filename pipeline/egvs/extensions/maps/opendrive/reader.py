@@ -15,15 +15,20 @@ World frame: that of the network, x east, y north in metres. Without a projectio
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
+
+import numpy as np
 
 from egvs.core import files, limits
 from egvs.core.errors import InputError
 from egvs.core.wording import by_number, list_first, number_of
+from egvs.creation.driving_side import DrivingSide, Evidence, choose_side, majority, side_in_frame
 from egvs.creation.map_parts import RoadMap, RoadOptions
 from egvs.creation.terrain import draping, network_heights
+from egvs.creation.turns import Connection, list_turns, patch_network
 from egvs.extensions.maps.formats import opendrive
 from egvs.extensions.maps.formats.opendrive import OpenDriveMap, Road
 from egvs.extensions.maps.formats.opendrive_copy import CopyOptions, write_copy
@@ -36,7 +41,7 @@ from egvs.extensions.maps.opendrive.check import (
     read_made_network,
 )
 from egvs.extensions.maps.opendrive.lane_changes import ForbiddenChanges, find_forbidden_changes, forbid_changes
-from egvs.extensions.maps.opendrive.turns import DRIVING_TYPES, permitted_turns
+from egvs.extensions.maps.opendrive.turns import DRIVING_TYPES, mirrored, permitted_turns
 from egvs.formats import georeference
 from egvs.traffic import sumo
 
@@ -52,7 +57,7 @@ _WALK_FLAGS = ("--walkingareas", "--crossings.guess")
 _OWN_FRAME_FLAG = "--offset.disable-normalization"
 
 _MAP, _NETWORK, _PATCHED = "map.xodr", "network.net.xml", "patched.net.xml"
-_EDGE_PATCH, _CONNECTION_PATCH = "patch.edg.xml", "patch.con.xml"
+_EDGE_PATCH = "patch.edg.xml"
 _GENERATED = re.compile(r"<!-- generated on .*?-->", re.DOTALL)
 _GEOID = re.compile(r"\+(?:geoidgrids|vunits|vto_meter)=\S+\s*")
 _LISTED = 5
@@ -66,20 +71,20 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     path
         The map, gzipped or not.
     options
-        Traffic drives on the left if they say so, or the map does (``rule="LHT"``); then lanes with positive ids lead
-        along their roads. With ``walk``, sidewalks are imported, and crossings are guessed.
+        Traffic drives on the left if they say so, or the map does (``rule="LHT"``, or its lanes); then lanes with
+        positive ids lead along their roads. With ``walk``, sidewalks are imported, and crossings are guessed.
 
     Raises
     ------
     InputError
-        When the map is damaged, is for right-hand traffic although the options say otherwise, has roads for left- and
-        for right-hand traffic, or netconvert cannot use it.
+        When the map is damaged, is for the other side of traffic than the options say, has roads for left- and for
+        right-hand traffic, or netconvert cannot use it.
     """
     road_map = opendrive.read_opendrive(path)
     check_size(road_map, path)
-    is_lefthand_map = _is_lefthand(road_map, path)
-    lefthand = options.lefthand or is_lefthand_map
     reference, notes = _projection(road_map, path)
+    side = _choose_side(road_map, reference, options.requested_left, path)
+    lefthand = side.lefthand
     copy_options = CopyOptions(
         reference,
         rotation_rad=road_map.offset_rad if reference else 0.0,
@@ -90,12 +95,11 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     with files.temporary_folder() as folder:
         write_copy(path, road_map, folder / _MAP, copy_options)
         copied = _read_copy(folder / _MAP, path)
-        if lefthand and not is_lefthand_map:
-            _check_lefthand(road_map, copied, path)
         flags = [*_FLAGS, *(["--lefthand"] if lefthand else []), *([] if reference else [_OWN_FRAME_FLAG])]
         if options.walk:
             flags.append("--opendrive.import-all-lanes")
-        _netconvert(["--opendrive-files", _MAP, *flags], folder, _NETWORK, path)
+        with _netconvert_errors(path):
+            sumo.run_netconvert(["--opendrive-files", _MAP, *flags], folder, _NETWORK)
 
         made = read_made_network(folder / _NETWORK)
         comparison = compare_with_map(made, copied, mirrored=lefthand)
@@ -121,7 +125,7 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     has_heights = bool(height_m) or any(_has_relief(road) for road in road_map.roads.values())
     if has_heights:
         notes += _level_notes(text)
-    return RoadMap(text, notes=(*notes, *_map_notes(road_map)), has_heights=has_heights)
+    return RoadMap(text, notes=(*notes, *_map_notes(road_map), side.note), has_heights=has_heights)
 
 
 def _read_copy(copy: Path, path: Path) -> OpenDriveMap:
@@ -152,21 +156,43 @@ def _import_all(_lane_type: str) -> bool:
     return True
 
 
-def _is_lefthand(road_map: OpenDriveMap, path: Path) -> bool:
-    lefthand = [road.id for road in road_map.roads.values() if road.lefthand]
-    if 0 < len(lefthand) < len(road_map.roads):
-        problem = f"has roads for left-hand traffic ({_listed(lefthand)}) and for right-hand traffic"
+def _choose_side(road_map: OpenDriveMap, reference: str, lefthand: bool | None, path: Path) -> DrivingSide:
+    """Decide on which side traffic drives: as the roads state, or else as their lanes lead; maps up to version 1.4 do
+    not state a rule.
+    """
+    roads = road_map.roads.values()
+    left = [road.id for road in roads if road.rule == "LHT"]
+    if 0 < len(left) < len(roads):
+        problem = f"has roads for left-hand traffic ({_listed(left)}) and for right-hand traffic"
         raise InputError(path, problem, "Use a map in which all traffic keeps to one side.")
-    return bool(lefthand)
+    evidence: Evidence | None
+    if any(road.rule for road in roads):
+        evidence = (
+            Evidence("left", 'its roads state rule="LHT"') if left else Evidence("right", 'its roads state rule="RHT"')
+        )
+    else:
+        right_turns, left_turns = (_turns_in_junctions(lanes) for lanes in (road_map, mirrored(road_map)))
+        counts = {"right": right_turns, "left": left_turns}
+        reasons = [
+            f"{counts[side]} turns are from lanes on the {side}, {counts[other]} from lanes on the {other}"
+            for side, other in (("left", "right"), ("right", "left"))
+        ]
+        evidence = majority(left_turns, right_turns, (reasons[0], reasons[1]))
+    of_map = [] if evidence is None else [evidence]
+    return choose_side(lefthand, of_map, _side_of_position(road_map, reference, path), str(path))
 
 
-def _check_lefthand(road_map: OpenDriveMap, swapped: OpenDriveMap, path: Path) -> None:
-    """Raise an InputError when the lanes on the right lead along their roads; older maps do not state a rule."""
-    right, left = len(permitted_turns(road_map)), len(permitted_turns(swapped))
-    if right > left:
-        problem = f"is for right-hand traffic: {right} turns are from lanes on the right, {left} from lanes on the left"
-        hint = "Read it without --lefthand; let netconvert write it with --opendrive-output.lefthand-left."
-        raise InputError(path, problem, hint)
+def _turns_in_junctions(road_map: OpenDriveMap) -> int:
+    return sum(bool(turn.junction) for turn in permitted_turns(road_map))
+
+
+def _side_of_position(road_map: OpenDriveMap, reference: str, path: Path) -> Evidence | None:
+    """Return the side of traffic where a map lies; its lanes count more."""
+    start = next((road.plan[0] for road in road_map.roads.values() if road.plan), None)
+    if not reference or start is None:
+        return None
+    frame = georeference.WorldFrame.from_projection(reference, (0.0, 0.0), str(path))
+    return side_in_frame(frame, np.add((start.x_m, start.y_m), road_map.offset_m[:2]).tolist())
 
 
 def _projection(road_map: OpenDriveMap, path: Path) -> tuple[str, tuple[str, ...]]:
@@ -184,9 +210,11 @@ def _projection(road_map: OpenDriveMap, path: Path) -> tuple[str, tuple[str, ...
         return "", (problem,)
 
 
-def _netconvert(arguments: Sequence[str], folder: Path, name: str, path: Path) -> None:
+@contextmanager
+def _netconvert_errors(path: Path) -> Iterator[None]:
+    """Raise netconvert's errors as those of a map."""
     try:
-        sumo.run_netconvert(arguments, folder, name)
+        yield
     except sumo.SumoInputError as error:
         problem = f"netconvert cannot use the map: {error}"
         raise InputError(path, problem, "Correct the map, or export it again.") from None
@@ -194,26 +222,21 @@ def _netconvert(arguments: Sequence[str], folder: Path, name: str, path: Path) -
 
 def _patch(folder: Path, made: MadeNetwork, comparison: MapComparison, options: RoadOptions, path: Path) -> str:
     """Add missing connections, remove others, and close lanes; return the name of the resulting network."""
-    connections = [
-        f'<delete from={quoteattr(source)} to={quoteattr(target)} fromLane="{source_lane}" toLane="{target_lane}"/>'
-        for source, source_lane, target, target_lane in comparison.added
-    ]
-    connections += [
-        f"<connection from={quoteattr(source.edge)} to={quoteattr(target.edge)}"
-        f' fromLane="{source.index}" toLane="{target.index}"/>'
+    added = [
+        Connection(source.edge, source.index, target.edge, target.index)
         for source, target in comparison.missing.values()
+        if made.turns.can_connect(source.edge, target.edge)
     ]
+    removed = [Connection(*connection) for connection in comparison.added]
     edges = _edge_patches(made) if options.walk else []
-    if not connections and not edges:
+    if not added and not removed and not edges:
         return _NETWORK
-    arguments = ["-s", _NETWORK, *_PATCH_FLAGS]
-    if connections:
-        (folder / _CONNECTION_PATCH).write_text(_element("connections", connections), encoding="utf-8")
-        arguments += ["-x", _CONNECTION_PATCH]
+    flags = [*_PATCH_FLAGS]
     if edges:
         (folder / _EDGE_PATCH).write_text(_element("edges", edges), encoding="utf-8")
-        arguments += ["-e", _EDGE_PATCH, *_WALK_FLAGS]
-    _netconvert(arguments, folder, _PATCHED, path)
+        flags += ["-e", _EDGE_PATCH, *_WALK_FLAGS]
+    with _netconvert_errors(path):
+        patch_network(folder, _NETWORK, _PATCHED, removed=removed, added=added, flags=flags)
     return _PATCHED
 
 
@@ -248,11 +271,12 @@ def _patch_notes(before: MapComparison, after: MapComparison) -> tuple[str, ...]
             f"{len(added)} of {number_of(before.turns, 'turn')} that netconvert had lost"
             f" {by_number(len(added), 'was', 'were')} added, from roads {roads}."
         )
-    removed = {*before.added} - {*after.added}
+    removed = sorted({*before.added} - {*after.added})
     if removed:
+        edges = list_turns(f"{source} to {target}" for source, _, target, _ in removed)
         notes.append(
             f"{number_of(len(removed), 'connection')} that {by_number(len(removed), 'is', 'are')} not in the map"
-            f" {by_number(len(removed), 'was', 'were')} removed."
+            f" {by_number(len(removed), 'was', 'were')} removed: {edges}."
         )
     return tuple(notes)
 

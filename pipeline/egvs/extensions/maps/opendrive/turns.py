@@ -10,9 +10,10 @@ Lanes of connecting roads are no lanes of the result: SUMO makes them lanes insi
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
-from egvs.extensions.maps.formats.opendrive import ContactPoint, Link, OpenDriveMap, Road
+from egvs.extensions.maps.formats.opendrive import ContactPoint, LaneLink, LaneSection, Link, OpenDriveMap, Road
 
 DRIVING_TYPES = frozenset(
     {"driving", "entry", "exit", "offRamp", "onRamp", "connectingRamp", "slipLane", "mwyEntry", "mwyExit",
@@ -61,6 +62,30 @@ def permitted_turns(road_map: OpenDriveMap) -> tuple[Turn, ...]:
         for target, junction in _next_lanes(road_map, key, key.lane < 0):
             turns.add(Turn(key, target, junction))
     return tuple(sorted(turns))
+
+
+def mirrored(road_map: OpenDriveMap) -> OpenDriveMap:
+    """Return a map in which the ids of all lanes change their sign, as if traffic kept to the other side."""
+    roads = {
+        road.id: replace(road, sections=tuple(map(_mirrored_section, road.sections)))
+        for road in road_map.roads.values()
+    }
+    junctions = {
+        junction: tuple(
+            replace(connection, links=tuple(LaneLink(-pair.incoming, -pair.connecting) for pair in connection.links))
+            for connection in connections
+        )
+        for junction, connections in road_map.junctions.items()
+    }
+    return replace(road_map, roads=roads, junctions=junctions)
+
+
+def _mirrored_section(section: LaneSection) -> LaneSection:
+    lanes = {}
+    for lane in section.lanes.values():
+        before, after = (tuple(-number for number in linked) for linked in (lane.predecessors, lane.successors))
+        lanes[-lane.id] = replace(lane, id=-lane.id, predecessors=before, successors=after)
+    return replace(section, lanes=lanes)
 
 
 def _has_width(widths: tuple[object, ...]) -> bool:
