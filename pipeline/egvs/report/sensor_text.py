@@ -14,12 +14,12 @@ from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.sensors.sensor import scenario_sensor
 
 SENSOR_EVIDENCE = (
-    "How far to trust this: in simulation, at six held-out junctions with twelve sensors, the mean of cluster and "
-    "pointpillars ranked sites nearly as three detectors do (rank correlation {rho[0]:.2f} to {rho[1]:.2f}). But the "
-    "first of a ranking lost up to {loss_points} points of AP, and {largest_loss_points} once; shares found with "
-    "{underrated_sensors[0]} and {underrated_sensors[1]} are {underrated_points[0]} to {underrated_points[1]} points "
-    "higher than expected. Do not decide between sensors by less than about 10 points, nor by the cost of one more "
-    "point. See docs/validity.md."
+    "How far to trust this: in simulation without losses of returns, at six held-out junctions with twelve sensors, "
+    "the mean of cluster and pointpillars ranked sites nearly as three detectors do (rank correlation {rho[0]:.2f} to "
+    "{rho[1]:.2f}). But the first of a ranking lost up to {loss_points} points of AP, and {largest_loss_points} once; "
+    "shares found with {underrated_sensors[0]} and {underrated_sensors[1]} are {underrated_points[0]} to "
+    "{underrated_points[1]} points higher than expected. Do not decide between sensors by less than about 10 points, "
+    "nor by the cost of one more point. See docs/validity.md."
 ).format(**dict(STUDY.larger_study))
 """What is known about rankings of sensors by the recommended score (docs/validity.md)."""
 
@@ -41,7 +41,10 @@ LOSSES_EVIDENCE = (
 )
 """What is known about losses of returns."""
 
-_INTERVAL_SENTENCE = "± contains the interval of the reflectivity, 0.03 to 0.06, by which sensors gain unequally."
+_INTERVAL_SENTENCE = (
+    "± contains the interval of the reflectivity, 0.03 to 0.06, the same for all sensors, but no error of a maker's "
+    "rated range."
+)
 
 _NO_INTERVAL_SENTENCE = (
     "± does not contain the interval of the reflectivity, 0.03 to 0.06: egvs compare SCENARIO --sensors adds it."
