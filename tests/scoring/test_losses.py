@@ -164,30 +164,3 @@ def test_expected_gap_equals_mean_over_draws(probability: float, count: int) -> 
         widths.append(parts[-1] - parts[0] + 1 if len(parts) else 0)
     assert share[0] * slices == pytest.approx(np.mean(gaps), abs=1.0)
     np.testing.assert_allclose(spans[0] * slices, np.mean(widths), atol=5 * np.std(widths) / 141 + 1e-3)
-
-
-def test_listed_hits_add_up_as_runs_of_beams_do() -> None:
-    rng = np.random.default_rng(3)
-    beams, per_m = 320, 50.0
-    directions = np.array([np.ones(beams), *rng.uniform(-0.1, 0.1, (2, beams))])
-    directions /= np.sqrt((directions**2).sum(axis=0))
-    box = np.array([1.0, 0, 0, -20.0, 2.2, 0, 1.0, 0, 0.3, 0.9, 0, 0, 1.0, -0.2, 0.7])
-    t_m = rng.uniform(18.0, 21.0, beams)
-    ends_here = rng.random(beams) < 0.4
-    nearest_m = np.where(ends_here, t_m, t_m - 1.0)
-    parabola = (0.4, -2e-3, -1e-6, 20.0 * per_m)
-
-    def empty_sums() -> tuple[np.ndarray, ...]:
-        return np.zeros(1), np.zeros(1), np.zeros(1, dtype=np.uint64), np.full((1, 2), np.inf), np.full((1, 2), -np.inf)
-
-    of_runs, of_list = empty_sums(), empty_sums()
-    runs = np.array([[0, beams]])
-    vehicle_visibility._weigh_box_hits(0, box, directions, runs, nearest_m, t_m, parabola, per_m, of_runs)
-    rows, misses = np.flatnonzero(ends_here), np.empty((2, vehicle_visibility.SLICES), dtype=np.float32)
-    vehicle_visibility._weigh_listed_hits(0, box, directions, rows, nearest_m, parabola, per_m, misses, of_list)
-    for one, other in zip(of_runs, of_list, strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert 0.0 < of_list[1][0] < of_list[0][0] < len(rows)
-    share = np.clip(0.4 + (t_m[rows] - 20.0) * per_m * (-2e-3 - 1e-6 * (t_m[rows] - 20.0) * per_m), 0.0, 1.0)
-    np.testing.assert_allclose(of_list[0][0], share.sum(), rtol=1e-6)
-    np.testing.assert_allclose(misses.prod(axis=1, dtype=np.float64), np.prod(1.0 - share), rtol=1e-4)

@@ -420,38 +420,20 @@ def _weigh_box_hits(b, box, directions, runs, nearest_m, t_m, parabola, per_m, s
 
 
 @_kernel
-def _weigh_listed_hits(b, box, directions, rows, nearest_m, parabola, per_m, misses, sums):  # type: ignore[no-untyped-def]
-    """Fill the sums of :func:`first_hits` and the misses for box b, on which the beams ``rows`` end.
-
-    The sums are those of :func:`_weigh_box_hits` to the last bit.
-    """
+def _miss_slices(box, directions, rows, nearest_m, parabola, per_m, misses):  # type: ignore[no-untyped-def]
+    """Fill the misses (2, SLICES) of a box: the probability that no return of the beams ``rows`` is from a slice."""
     c0, c1, c2, middle = parabola
     ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
     bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
     x, y, z = directions[0], directions[1], directions[2]
     misses[:] = 1.0
     by_length, by_width = misses[0], misses[1]
-    units, side_units, parts = np.int64(0), np.int64(0), np.uint64(0)
-    a_low, a_high, b_low, b_high = _LARGEST_KEY, -_LARGEST_KEY, _LARGEST_KEY, -_LARGEST_KEY
     for n in rows:
         t = nearest_m[n]
         steps = t * per_m - middle
-        share = min(max(c0 + steps * (c1 + steps * c2), 0.0), 1.0)
-        along = ao + t * (ax * x[n] + ay * y[n] + az * z[n])
-        across = bo + t * (bx * x[n] + by * y[n] + bz * z[n])
-        in_units = np.int64(np.int32(_SHARE_UNIT * share))
-        units += in_units
-        side_units += in_units if _is_on_side(along, across, ah, bh) else np.int64(0)
-        part, miss = _slice_of(along, ah), np.float32(1.0 - share)
-        parts |= np.uint64(1) << part
-        by_length[part] *= miss
-        by_width[_slice_of(across, bh)] *= miss
-        u, v = _order_key(along), _order_key(across)
-        a_low, a_high, b_low, b_high = min(a_low, u), max(a_high, u), min(b_low, v), max(b_high, v)
-    total, sides, slices, low, high = sums
-    total[b], sides[b], slices[b] = units / _SHARE_UNIT, side_units / _SHARE_UNIT, parts
-    low[b, 0], high[b, 0] = _key_value(a_low), _key_value(a_high)
-    low[b, 1], high[b, 1] = _key_value(b_low), _key_value(b_high)
+        miss = np.float32(1.0 - min(max(c0 + steps * (c1 + steps * c2), 0.0), 1.0))
+        by_length[_slice_of(ao + t * (ax * x[n] + ay * y[n] + az * z[n]), ah)] *= miss
+        by_width[_slice_of(bo + t * (bx * x[n] + by * y[n] + bz * z[n]), bh)] *= miss
 
 
 @_kernel
@@ -616,16 +598,17 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, loss, sums, hits):  # 
                 if has_losses and weight.shape[0] == 0:
                     parabola, error = _box_parabola(facing[k], loss[0][loss[1][b]], loss[2])
                     is_smooth = error <= SHARE_TOLERANCE
-                box_rows = rows[: _list_rows(box_runs, nearest_m, box_t_m, rows)]
-                is_certain = is_smooth and box_rows.shape[0] == 0
-                if is_smooth and box_rows.shape[0] >= MANY_POINTS:
+                if is_smooth:
                     _weigh_box_hits(b, facing[k], directions, box_runs, nearest_m, box_t_m, parabola, loss[2], added)
-                    is_certain = added[0][b] >= MANY_POINTS
+                is_certain = is_smooth and (added[0][b] >= MANY_POINTS or added[2][b] == np.uint64(0))
+                box_rows = rows[:0]
+                if not is_certain:
+                    box_rows = rows[: _list_rows(box_runs, nearest_m, box_t_m, rows)]
                 if is_certain:
                     loss[3][b] = -1
                 elif is_smooth:
-                    misses = loss[4][loss[3][b]]
-                    _weigh_listed_hits(b, facing[k], directions, box_rows, nearest_m, parabola, loss[2], misses, added)
+                    box_misses = loss[4][loss[3][b]]
+                    _miss_slices(facing[k], directions, box_rows, nearest_m, parabola, loss[2], box_misses)
                 elif has_losses:
                     _thin_box_hits(b, facing[k], directions, box_rows, nearest_m, weight, loss, added)
                 elif room > 0:
