@@ -11,6 +11,7 @@ from egvs.results.sensors import SensorComparison, difference_unit
 from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.sensors.return_model import REFLECTIVITY_INTERVAL
 from egvs.sensors.sensor import scenario_sensor
 
 SENSOR_EVIDENCE = (
@@ -54,6 +55,20 @@ _NO_INTERVAL_SENTENCE = (
 def describe_losses(*, has_interval: bool) -> str:
     """Return what is known about losses of returns, and whether errors of differences contain their interval."""
     return f"{LOSSES_EVIDENCE} {_INTERVAL_SENTENCE if has_interval else _NO_INTERVAL_SENTENCE}"
+
+
+def describe_order(comparison: SensorComparison) -> str:
+    """Return whether the order of the sensors is the same at both ends of the interval of the reflectivity, or empty.
+
+    Empty where it is unknown.
+    """
+    order, at_high = comparison.order, comparison.order_at_high_reflectivity
+    if not at_high:
+        return ""
+    low, high = REFLECTIVITY_INTERVAL
+    if at_high == order:
+        return f"From {low:g} to {high:g}, the order of the sensors stays the same: {', '.join(order)}."
+    return f"At {high:g}, the order of the sensors is {', '.join(at_high)}; at {low:g}, it is {', '.join(order)}."
 
 
 def sensors_without_losses(scenario: Scenario, sensors: Iterable[str]) -> list[str]:
