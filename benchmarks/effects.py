@@ -16,13 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import egvs
+from benchmarks.losses import OFF, losses_ratio
 from egvs.artefacts.tpog import Tpog, read_tpog
-from egvs.runs.run_context import open_folder
 from egvs.scoring.visibility import Beams, HitCounter
 from egvs.sensors.scanner import Scanner
 from egvs.stages import scene_inputs
-from egvs.stages.site_scans import empty_scans
-from egvs.stages.site_scoring import SiteScoring
 from egvs.world.mesh import World, read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -42,7 +40,6 @@ COSTS: dict[str, tuple[list[str], float | None]] = {
 }
 """Settings, and the largest allowed ratio to the plain scene."""
 
-PLAIN = "effects.range_limit=false"
 MAX_LOSSES_RATIO = 1.3
 """Largest allowed ratio of all scores of a site with losses of returns to those without."""
 
@@ -59,7 +56,7 @@ class Work:
     def of(cls, settings: list[str], world: World, tpog: Tpog, run: Path) -> Work:
         """Prepare the static world, TPOG and trajectories of a finished run."""
         is_named = any(setting.startswith("effects.range_limit") for setting in settings)
-        scene = scene_inputs.resolve_scene(egvs.load(SCENARIO, settings if is_named else [PLAIN, *settings]), world)
+        scene = scene_inputs.resolve_scene(egvs.load(SCENARIO, settings if is_named else [OFF, *settings]), world)
         scanner = Scanner(scene)
         beams = [Beams.of(scanner.scan_site(site)) for site in scene.sites[:SITES]]
         return cls(HitCounter(scene, tpog, run / "trajectories.parquet"), beams, np.flatnonzero(tpog.counts))
@@ -89,27 +86,7 @@ def rows(run: Path) -> list[tuple[str, str, str, bool]]:
         ratio = statistics.median(ratios[name])
         bound = "" if most is None else f"{most:g} x"
         table.append((f"  {name}, compared with no effect", f"{ratio:.2f} x", bound, most is None or ratio <= most))
-    ratio = losses_ratio(run)
+    ratio = losses_ratio(SCENARIO, [], run)
     name = "  losses of returns in all scores of a site, compared with none"
     table.append((name, f"{ratio:.2f} x", f"{MAX_LOSSES_RATIO:g} x", ratio <= MAX_LOSSES_RATIO))
     return table
-
-
-def losses_ratio(run: Path) -> float:
-    """Return the cost of the scores of some sites with losses of returns, in multiples of that without."""
-    scorings = []
-    for setting in (PLAIN, "effects.range_limit={}"):
-        context = open_folder(egvs.load(SCENARIO, [setting]), run, jobs=1)
-        scoring = SiteScoring(context)
-        scorings.append((scoring, list(empty_scans(context, scoring.names[:SITES]))))
-    ratios = []
-    for turn in range(REPEATS + 1):
-        taken = []
-        for scoring, scans in scorings:
-            start = time.process_time()
-            for scan in scans:
-                scoring.score(scan)
-            taken.append(time.process_time() - start)
-        if turn:  # the first compiles
-            ratios.append(taken[1] / taken[0])
-    return statistics.median(ratios)

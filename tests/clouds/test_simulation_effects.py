@@ -8,9 +8,13 @@ import pytest
 
 from egvs.clouds.simulation import CloudSimulator, sweep_rng
 from egvs.effects.base import Detect
+from egvs.effects.returns import ReturnProbability
+from egvs.scoring.targets import TargetRecord, visible_targets
+from egvs.scoring.visibility import Beams
 from egvs.sensors.return_model import ReturnModel
+from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Pose
-from tests.clouds.cloud_scenes import build_scene, frame_of, make_sensor, random_frame
+from tests.clouds.cloud_scenes import build_scene, frame_of, make_sensor, random_frame, use_boxes_for
 from tests.conftest import BUILDING, collection, feature
 
 FINE = {"elevations_deg": [-40, -2], "channels": 40, "azimuth_step_deg": 1.0}
@@ -220,3 +224,33 @@ def test_points_on_vehicles_are_those_that_scores_expect(mini):
     spread = math.sqrt(draws * (by_score * (1 - by_score)).sum())
     assert abs(kept.sum() - draws * by_score.sum()) < 4 * spread + 0.02 * draws * by_score.sum()
     assert kept[is_glass].sum() < draws * by_score[is_glass].sum() - 4 * math.sqrt(draws * is_glass.sum()) / 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "kind"),
+    [
+        (["effects.range_limit={rated_range_m=30}"], "pedestrian"),
+        (["effects.range_limit={rated_range_m=30, reflectivity=0.03}", "effects.dropout.share=0.2"], "passenger"),
+    ],
+    ids=["by_class", "of_all"],
+)
+def test_mean_count_of_points_is_that_of_the_scores(mini, settings, kind):
+    """Boxes as bodies, without windows: over many sweeps, vehicles have as many points as scores expect."""
+    settings = [*settings, "effects.range_limit.rated_reflectivity=0.1", *use_boxes_for(mini, "pedestrian", "sedan")]
+    scene, sensor = build_scene(mini, *settings), make_sensor(**FINE)
+    rows = [(x, y, 0.8, 4.4, 1.8, 1.5, yaw, 0.0) for x, y, yaw in ((14, 4, 0.3), (22, 6, 1.2), (19, -4, 2.0))]
+    frame = frame_of(rows, [kind] * len(rows))
+    record = TargetRecord.of([frame], scene.scenario.roi.grid, {"pedestrian"})
+    assert len(record) == len(rows)
+    beams = Beams.of(Scanner(scene).scan(POSE, sensor))
+    expected = visible_targets(record, beams, ReturnProbability.of(scene, sensor)).points
+    met = visible_targets(record, beams).points
+    assert (expected < 0.9 * met).all() and (expected > 5.0).all()
+
+    simulator = CloudSimulator(scene, POSE, sensor, "here")
+    counts = np.zeros(len(rows))
+    sweeps = 200
+    for number in range(sweeps):
+        counts += simulator.sweep(frame, sweep_rng(3, "here", number)).points_on(len(rows))
+    standard_error = np.sqrt(expected / sweeps)
+    assert (np.abs(counts / sweeps - expected) < 4 * standard_error).all()

@@ -552,12 +552,16 @@ def test_list_has_one_line_per_sensor_that_fits_a_narrow_terminal(run_egvs) -> N
     assert "costs.sensor" in out
 
 
-def test_list_converts_rated_ranges_as_the_effect_does(run_egvs) -> None:  # type: ignore[no-untyped-def]
+def test_list_converts_rated_ranges_as_the_effect_does_and_marks_unchecked_ones(run_egvs) -> None:  # type: ignore[no-untyped-def]
     effect = RangeLimit(RangeLimitParameters(reflectivity=0.1))
     table = run_egvs("sensors")[1].splitlines()
     for name, entry in CATALOGUE.items():
         line = next(line for line in table if line.startswith(f"{name} "))
-        assert float(line.split()[-1]) == pytest.approx(effect.limit_m(entry), abs=0.5)
+        number, mark = line.rstrip("au ").split()[-1], line.split()[-1]
+        assert float(number) == pytest.approx(effect.limit_m(entry), abs=0.5)
+        words = {"a": "assumed", "u": "unchecked"}
+        assert words.get(mark, "") in entry.rated_source
+        assert mark in words or not any(word in entry.rated_source for word in words.values())
 
 
 def test_details_of_a_sensor_have_source_and_assumptions(run_egvs) -> None:  # type: ignore[no-untyped-def]

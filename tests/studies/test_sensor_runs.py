@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 import egvs
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
+from egvs.report.sensor_text import describe_order
 from egvs.sensors.sensor import CATALOGUE
 from egvs.studies.run_comparison import compare_runs
 from egvs.studies.sensor_runs import SensorRun, SensorRuns, prepare_runs, run_sensors
@@ -101,6 +103,7 @@ def test_interval_of_reflectivity_is_part_of_the_error(here: Path, run_egvs) -> 
         of_rho = [folder for folder in (here / "runs").iterdir() if f"reflectivity={rho}" in folder.name]
         other = compare_runs(of_rho).sensors
         assert other is not None and not other.has_loss_interval
+        assert describe_order(other) == ""
         by_sensor = {result.mount.sensor: result.mount.site.score for result in other.results}
         scores.append(by_sensor["OS1-64"] - by_sensor["VLP-16"])
         if rho == 0.03:
@@ -109,6 +112,17 @@ def test_interval_of_reflectivity_is_part_of_the_error(here: Path, run_egvs) -> 
     expected = math.hypot(plain.difference.se or 0.0, abs(scores[1] - scores[0]) / math.sqrt(3))
     assert gain.difference.se == pytest.approx(expected, rel=1e-6)
     assert gain.difference.se > (plain.difference.se or 0.0)
+    assert sensors.order_at_high_reflectivity == other.order
+    order = ", ".join(sensors.order)
+    assert describe_order(sensors) == f"From 0.03 to 0.06, the order of the sensors stays the same: {order}."
+    turned = replace(sensors, order_at_high_reflectivity=tuple(reversed(sensors.order)))
+    assert describe_order(turned).endswith(f"; at 0.03, it is {order}.")
+
+    off = prepare_runs(Path("mini"), "VLP-16,OS1-64", ["effects.range_limit=false"]).runs
+    for one in off:
+        egvs.run(one.scenario, one.folder)
+    without = compare_runs([one.folder for one in off]).sensors
+    assert without is not None and not without.has_loss_interval and describe_order(without) == ""
 
 
 def test_run_is_compared_with_its_own_settings(here: Path, mini: Path) -> None:

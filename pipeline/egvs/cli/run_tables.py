@@ -330,17 +330,18 @@ def print_sensors(sensors: Iterable[Sensor]) -> None:
         Column("rings", lambda sensor: str(sensor.channels or "-")),
         Column("view deg", _format_view),
         Column("beams", lambda sensor: str(sensor.beams)),
-        Column("range m", lambda sensor: f"{sensor.range_m:g}"),
+        Column("max m", lambda sensor: f"{sensor.range_m:g}"),
         Column("rated m", _format_rating),
-        Column(format_percent(DARK_REFLECTIVITY, 0), lambda sensor: format_or_dash(dark_range_m(sensor), ".0f")),
+        Column(format_percent(DARK_REFLECTIVITY, 0), _format_dark_range),
     ]
     print_table(columns, sensors, file_width=_LIST_FILE_WIDTH)
     print_sentences(
         (
             "view: azimuth x elevation. beams: of one turn or frame of 0.1 s, so ten times as many points per second.",
-            "range: no beam is longer. rated: how far the maker's sensor still detects a target of this reflectivity; "
+            "max: no beam is longer. rated: how far the maker's sensor still detects a target of this reflectivity; "
             f"the last column converts it to {format_percent(DARK_REFLECTIVITY, 0)} (dark vehicles), so "
-            "that sensors can be compared. "
+            "that sensors can be compared; a: assumed, the maker states no reflectivity, or rates another version; "
+            "u: unchecked, quoted from others; without a letter, it was checked against the maker's text. "
             "Losses of returns follow from it, where they can change a result: docs/effects.md.",
             "The catalogue has no prices, and does not say which sensors are still sold. Set prices with "
             "--set 'costs.sensor={\"NAME\" = PRICE}' or in [costs].",
@@ -354,6 +355,15 @@ def dark_range_m(sensor: Sensor) -> float | None:
     if sensor.rated_range_m is None:
         return None
     return sensor.rated_range_m * math.sqrt(DARK_REFLECTIVITY / sensor.rated_reflectivity)
+
+
+def _format_dark_range(sensor: Sensor) -> str:
+    """The rated range for dark vehicles, with a letter where it was not checked against the maker's text."""
+    mark = " "
+    for word in ("unchecked", "assumed"):
+        if word in (sensor.rated_source or ""):
+            mark = word[0]
+    return f"{format_or_dash(dark_range_m(sensor), '.0f')} {mark}"
 
 
 def print_sensor_details(sensors: Iterable[Sensor]) -> None:

@@ -22,6 +22,7 @@ from egvs.report.sensor_text import (
     costs_option,
     describe_evidence,
     describe_losses,
+    describe_order,
     explain_differences,
     noticed_preference,
     range_note,
@@ -272,6 +273,8 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
     if note := range_note(sensors.sensors, is_modelled=is_modelled):
         print_sentences([note])
     print_sentences([describe_evidence(sensors), describe_losses(has_interval=sensors.has_loss_interval)])
+    if order := describe_order(sensors):
+        print_sentences([order])
     out.print()
 
 

@@ -31,7 +31,7 @@ _SIZE_NOTE = (
 ).format(*STUDY.larger_study.level_error_points, STUDY.larger_study.largest_level_error_points)
 _NOTICED_NOTE = (
     "Found: a box overlaps the vehicle by more than 0.7 (IoU); noticed: people label it within 3 m, by curves from one "
-    "junction, whose errors are in its ± (docs/certainty.md)."
+    "junction; its ± contains their errors, not how far other places, sensors and people differ (docs/certainty.md)."
 )
 _COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = (

@@ -11,15 +11,16 @@ from egvs.results.sensors import SensorComparison, difference_unit
 from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.sensors.return_model import REFLECTIVITY_INTERVAL
 from egvs.sensors.sensor import scenario_sensor
 
 SENSOR_EVIDENCE = (
-    "How far to trust this: in simulation, at six held-out junctions with twelve sensors, the mean of cluster and "
-    "pointpillars ranked sites nearly as three detectors do (rank correlation {rho[0]:.2f} to {rho[1]:.2f}). But the "
-    "first of a ranking lost up to {loss_points} points of AP, and {largest_loss_points} once; shares found with "
-    "{underrated_sensors[0]} and {underrated_sensors[1]} are {underrated_points[0]} to {underrated_points[1]} points "
-    "higher than expected. Do not decide between sensors by less than about 10 points, nor by the cost of one more "
-    "point. See docs/validity.md."
+    "How far to trust this: in simulation without losses of returns, at six held-out junctions with twelve sensors, "
+    "the mean of cluster and pointpillars ranked sites nearly as three detectors do (rank correlation {rho[0]:.2f} to "
+    "{rho[1]:.2f}). But the first of a ranking lost up to {loss_points} points of AP, and {largest_loss_points} once; "
+    "shares found with {underrated_sensors[0]} and {underrated_sensors[1]} are {underrated_points[0]} to "
+    "{underrated_points[1]} points higher than expected. Do not decide between sensors by less than about 10 points, "
+    "nor by the cost of one more point. See docs/validity.md."
 ).format(**dict(STUDY.larger_study))
 """What is known about rankings of sensors by the recommended score (docs/validity.md)."""
 
@@ -41,7 +42,10 @@ LOSSES_EVIDENCE = (
 )
 """What is known about losses of returns."""
 
-_INTERVAL_SENTENCE = "± contains the interval of the reflectivity, 0.03 to 0.06, by which sensors gain unequally."
+_INTERVAL_SENTENCE = (
+    "± contains the interval of the reflectivity, 0.03 to 0.06, the same for all sensors, but no error of a maker's "
+    "rated range."
+)
 
 _NO_INTERVAL_SENTENCE = (
     "± does not contain the interval of the reflectivity, 0.03 to 0.06: egvs compare SCENARIO --sensors adds it."
@@ -51,6 +55,20 @@ _NO_INTERVAL_SENTENCE = (
 def describe_losses(*, has_interval: bool) -> str:
     """Return what is known about losses of returns, and whether errors of differences contain their interval."""
     return f"{LOSSES_EVIDENCE} {_INTERVAL_SENTENCE if has_interval else _NO_INTERVAL_SENTENCE}"
+
+
+def describe_order(comparison: SensorComparison) -> str:
+    """Return whether the order of the sensors is the same at both ends of the interval of the reflectivity, or empty.
+
+    Empty where it is unknown.
+    """
+    order, at_high = comparison.order, comparison.order_at_high_reflectivity
+    if not at_high:
+        return ""
+    low, high = REFLECTIVITY_INTERVAL
+    if at_high == order:
+        return f"From {low:g} to {high:g}, the order of the sensors stays the same: {', '.join(order)}."
+    return f"At {high:g}, the order of the sensors is {', '.join(at_high)}; at {low:g}, it is {', '.join(order)}."
 
 
 def sensors_without_losses(scenario: Scenario, sensors: Iterable[str]) -> list[str]:

@@ -225,11 +225,14 @@ class SensorComparison:
         Whether at least two costs are known, so that they can be compared.
     has_loss_interval
         Whether errors of differences contain the interval of the losses of returns.
+    order_at_high_reflectivity
+        Names of the sensors, best first, at the highest reflectivity of this interval; empty where it is unknown.
     """
 
     results: tuple[SensorResult, ...]
     has_costs: bool
     has_loss_interval: bool = False
+    order_at_high_reflectivity: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -296,6 +299,12 @@ class SensorComparison:
     def sensors(self) -> tuple[str, ...]:
         """Names of the sensors."""
         return tuple(dict.fromkeys(result.mount.sensor for result in self.results))
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Names of the sensors, best first."""
+        by_score = sorted(self.results, key=lambda result: -result.mount.site.score)
+        return tuple(dict.fromkeys(result.mount.sensor for result in by_score))
 
     @property
     def unpriced(self) -> tuple[str, ...]:

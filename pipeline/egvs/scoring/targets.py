@@ -542,12 +542,12 @@ class Losses(NamedTuple):
         """Tabulate the probability of returns up to a range, for each reflectivity of the record."""
         if not len(record):
             return NO_LOSSES
-        reflectivity, row = np.unique(record.reflectivity, return_inverse=True)
+        reflectivity, row_of_kind = np.unique(reflectivity_of(record.kinds), return_inverse=True)
         range_m = np.arange(math.ceil(farthest_m * _STEPS_PER_M) + 2) / _STEPS_PER_M
         shares = [return_probability(range_m, np.full(len(range_m), rho)) for rho in reflectivity]
         count = len(record.all_boxes.values)
         share_row, miss_row = np.zeros(count, dtype=np.int64), np.full(count, -1, dtype=np.int64)
-        share_row[record.row], miss_row[record.row] = row, np.arange(len(record))
+        share_row[record.row], miss_row[record.row] = row_of_kind[record.kind], np.arange(len(record))
         misses = np.empty((len(record), 2, vehicle_visibility.SLICES), dtype=np.float32)
         return cls(np.array(shares).reshape(len(shares), -1), share_row, _STEPS_PER_M, miss_row, misses)
 

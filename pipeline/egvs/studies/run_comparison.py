@@ -494,8 +494,13 @@ def _compare_sensors(
         return differences.between(first, second).widened(abs(change) / math.sqrt(3.0))
 
     comparison = SensorComparison.of(mounts, difference)
-    has_interval = len(changes) == len({(mount.run, mount.site.site) for mount in mounts})
-    return None if comparison is None else replace(comparison, has_loss_interval=has_interval)
+    is_known = len(changes) == len({(mount.run, mount.site.site) for mount in mounts})
+    has_interval = is_known and any(changes.values())  # nothing changes where losses are off
+    if comparison is None or not has_interval:
+        return comparison
+    at_high = sorted(mounts, key=lambda mount: -mount.site.score - changes[mount.run, mount.site.site])
+    order = tuple(dict.fromkeys(mount.sensor for mount in at_high))
+    return replace(comparison, has_loss_interval=True, order_at_high_reflectivity=order)
 
 
 def _interval_changes(folders: Mapping[str, Path], mounts: Sequence[SensorMount]) -> dict[tuple[str, str], float]:
