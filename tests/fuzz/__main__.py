@@ -41,7 +41,8 @@ def fuzz(kinds: list[str], number: int, seed: int, keep: Path) -> Results:
             for case in left:
                 verdict = _judge(bench, seed, case, keep)
                 counts[kind, verdict.name] += 1
-                line = {"seed": seed, "kind": kind, "case": case, "verdict": verdict.name, "told": verdict.told}
+                line = {"seed": seed, "kind": kind, "case": case, "verdict": verdict.name, "told": verdict.told,
+                        "busy_s": round(verdict.busy_s, 2), "peak_mb": round(verdict.peak_bytes / 1e6)}  # fmt: skip
                 results.write(json.dumps(line) + "\n")
                 results.flush()
             print(f"{kind}: {_told(counts, kind)}", flush=True)
@@ -66,6 +67,14 @@ def _judge(bench: Bench, seed: int, case: int, keep: Path) -> Verdict:
         path.write_bytes(data)
         print(f"  {verdict.name}: {path}: {verdict.told}", flush=True)
     return verdict
+
+
+def _worst(path: Path, seed: int) -> str:
+    """The case that worked longest, and the one with the largest memory."""
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    lines = [line for line in lines if line["seed"] == seed and "busy_s" in line]
+    worst = {key: max(lines, key=lambda line: float(line[key])) for key in ("busy_s", "peak_mb") if lines}
+    return "; ".join(f"most {key}: {line[key]} ({line['kind']}, case {line['case']})" for key, line in worst.items())
 
 
 def _told(counts: Results, kind: str) -> str:
@@ -103,6 +112,7 @@ def main() -> int:
         f"{sum(verdicts.values())} mutants of {len(kinds)} kinds: "
         + ", ".join(f"{n} {v}" for v, n in verdicts.most_common())
     )
+    print(_worst(given.keep / _RESULTS, given.seed))
     return int(any(verdict not in cases.WELL for verdict in verdicts))
 
 

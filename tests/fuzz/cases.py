@@ -26,7 +26,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import CodeType
@@ -57,20 +57,26 @@ WELL = ("refused", "same", "legal", "unkept")
 
 @dataclass(frozen=True)
 class Ended:
-    """How the command line ended: its exit code (below 0: a signal; None: out of time), what it printed, its peak."""
+    """How the command line ended: its exit code (below 0: a signal; None: out of time), what it printed, and what it took.
+
+    ``peak_bytes`` is the largest resident memory of one of its processes, ``busy_s`` the processor time of all.
+    """
 
     code: int | None
     out: str
     err: str
     peak_bytes: int
+    busy_s: float
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """``name`` is one of WELL, or the fault; ``told`` the line that says most of it."""
+    """``name`` is one of WELL, or the fault; ``told`` the line that says most of it; and what the case took."""
 
     name: str
     told: str = ""
+    peak_bytes: int = 0
+    busy_s: float = 0.0
 
 
 def run(folder: Path, arguments: Sequence[str], store: bool = False) -> Ended:
@@ -81,9 +87,9 @@ def run(folder: Path, arguments: Sequence[str], store: bool = False) -> Ended:
     sys.stderr.flush()
     if not (child := os.fork()):
         become(folder, arguments, printed, store)
-    code, peak = _wait(child)
+    code, peak, busy_s = _wait(child)
     out, err = (path.read_text(errors="replace") for path in printed)
-    return Ended(code, out, err, peak)
+    return Ended(code, out, err, peak, busy_s)
 
 
 def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], store: bool) -> None:
@@ -131,8 +137,8 @@ def _limit() -> None:
         resource.setrlimit(what, (limit, limit))
 
 
-def _wait(child: int) -> tuple[int | None, int]:
-    """Exit code and peak of a child, which is killed when its time is over."""
+def _wait(child: int) -> tuple[int | None, int, float]:
+    """Exit code, peak and processor time of a child, which is killed when its time is over."""
     descriptor, last = os.pidfd_open(child), time.monotonic() + _MOST_WAITING
     try:
         while not (ready := select.select([descriptor], [], [], 1.0)[0]):
@@ -146,7 +152,8 @@ def _wait(child: int) -> tuple[int | None, int]:
     _, status, used = os.wait4(child, 0)
     with suppress(ProcessLookupError):  # SUMO ends with it, but later
         os.killpg(child, signal.SIGKILL)
-    return os.waitstatus_to_exitcode(status) if ready else None, used.ru_maxrss * 1024
+    code = os.waitstatus_to_exitcode(status) if ready else None
+    return code, used.ru_maxrss * 1024, used.ru_utime + used.ru_stime
 
 
 def _busy_s(process: int) -> float:
@@ -185,7 +192,8 @@ class Bench:
         self._lay()
         (self._case / file.relative_to(self._base)).write_bytes(data)
         ended = run(self._case, self.kind.verb, self.kind.store)
-        return _fault_of(ended) or self._answer(ended, file, data)
+        verdict = _fault_of(ended) or self._answer(ended, file, data)
+        return replace(verdict, peak_bytes=ended.peak_bytes, busy_s=ended.busy_s)
 
     def _answer(self, ended: Ended, file: Path, data: bytes) -> Verdict:
         last = next((line for line in reversed(ended.err.splitlines()) if line.strip()), "")
