@@ -57,7 +57,7 @@ WELL = ("refused", "same", "legal", "unkept")
 
 @dataclass(frozen=True)
 class Ended:
-    """How the command line ended: its exit code (below 0: a signal; None: out of time), what it printed, and what it took.
+    """How the command line ended: exit code (below 0: a signal; None: out of time), what it printed, and what it took.
 
     ``peak_bytes`` is the largest resident memory of one of its processes, ``busy_s`` the processor time of all.
     """
