@@ -49,6 +49,10 @@ _LONGEST_MESSAGE = 4000
 _ROW = re.compile(r"\bsite '?[^\s:']+'?(?: and \d+ more)?:")
 """A message may name a row, a site, in place of the file that it stands in."""
 
+_TEMPORARY = re.compile(r"(?:\.tmp|\.pending)/")
+"""In a message: a file that the user does not know."""
+_PYTHON_WARNING = re.compile(r"^\S+:\d+: \w*Warning: ", re.MULTILINE)
+
 _SCORES = ("egvs", "egvs_limit", "rank", "entropy_seen")
 _NO_VEHICLE = ("no vehicle in the region", "so there is no ranking")
 _OF_VEHICLES = ("expected_detections", "points_on_target", "seen_well")
@@ -208,6 +212,8 @@ class Bench:
         said = ended.err + ended.out
         if not self.kind.names_others and file.name not in said and _ROW.search(said) is None:
             return Verdict("file not named", (last or ended.out)[:300])
+        if match := _TEMPORARY.search(said):
+            return Verdict("names a temporary file", said[max(0, match.start() - 200) : match.end() + 100])
         return Verdict("refused", (last or ended.out)[:300])
 
     def _ranking(self, ended: Ended, file: Path, data: bytes) -> Verdict:
@@ -253,6 +259,8 @@ def _fault_of(ended: Ended) -> Verdict | None:
         return Verdict(
             "traceback", next((line for line in reversed(ended.err.splitlines()) if line.strip()), last)[:300]
         )
+    if match := _PYTHON_WARNING.search(ended.err):
+        return Verdict("warning of Python", ended.err[match.start() :][:300])
     if ended.peak_bytes > MOST_BYTES:
         return Verdict("memory", f"{ended.peak_bytes / 2**30:.1f} GB; {last}")
     return None
