@@ -289,3 +289,29 @@ _ALL = (
 
 KINDS = {kind.name: kind for kind in _ALL}
 """By name."""
+
+FORMATS = {
+    "`scenario.toml`": ("scenario.toml", "extended scenario.toml", "city.toml", "track columns.toml"),
+    "JSON, GeoJSON": ("statics.geojson", "sites.geojson", "new city.json", "metadata.json", "labels openlabel"),
+    "polygons of any format": ("poly.xml", "new houses.geojson", "new city.gml"),
+    "tables in CSV": ("sites.csv", "junctions.csv", "new counts.csv", "signals.csv", "observed.csv", "labels csv"),
+    "XML of any kind": ("net.xml", "vtypes.xml", "new city.gml", "new terrain.xml", "new roads.xodr"),
+    "gzip of any file": ("net.xml.gz", "fcd.csv.gz", "new map.osm.gz", "sweep sweep.ply.gz"),
+    "FCD in Parquet": ("fcd.parquet", "fcd.parquet.gz"),
+    "tracks in CSV": ("tracks 07_tracks.csv", "tracks tracks.csv", "tracks 10001.csv"),
+    "tracks in Parquet, Feather": ("tracks scenario_hand-made.parquet", "tracks annotations.feather"),
+    "OpenStreetMap (XML, PBF)": ("new map.osm", "new map.osm.pbf"),
+    "points in CSV, PLY, PCD": ("scan.csv", "scan.ply binary", "scan.pcd binary", "new survey.pcd"),
+    "LAS": ("scan.las", "new survey.las"),
+    "LAZ": ("scan.laz", "new survey.laz"),
+    "E57": ("scan.e57", "new survey.e57"),
+    "meshes": ("mesh.obj", "mesh.stl", "mesh.ply", "mesh.glb", "mesh.gltf", "new house.off"),
+    "GeoPackage, Shapefile, KML": ("new houses.gpkg", "new houses.shp", "new houses.kml", "sites.gpkg", "sites.shp"),
+    "GeoParquet": ("new houses.parquet", "sites.parquet"),
+    "GeoTIFF": ("new terrain.tif",),
+    "ASCII grids": ("new terrain.asc", "new surface.asc"),
+    "sweeps in `.npz`": ("sweep sweep.npz",),
+    "networks, maps and demand for SUMO": ("net.xml", "sumocfg", "add.xml", "new roads.net.xml", "new lanelets.osm"),
+    "route files": ("rou.xml",),
+}
+"""Kinds of each row of the table "Limits by format" in docs/security.md."""

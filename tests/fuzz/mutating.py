@@ -76,7 +76,7 @@ def _changed(rng: random.Random, data: bytes) -> bytes:
         return _in_zip(rng, data)
     if data.startswith(b"ASTM-E57") and rng.random() < 0.7:
         return _in_e57(rng, data)
-    if rng.random() < 0.5 and (change := _structure(data)) is not None:
+    if rng.random() < 0.5 and (change := structure_change(data)) is not None:
         try:
             return change(rng, data)[:_MOST_BYTES]
         except Exception:  # noqa: BLE001 - an earlier change has broken the format
@@ -87,7 +87,7 @@ def _changed(rng: random.Random, data: bytes) -> bytes:
     return rng.choice(_ON_TEXT)(rng, text)[:_MOST_BYTES]
 
 
-def _structure(data: bytes) -> Change | None:
+def structure_change(data: bytes) -> Change | None:
     """What changes the structure of a file of this format; None where nothing does."""
     head = data[:2000].lstrip(b"\xef\xbb\xbf \r\n\t")
     for signs, change in _BY_SIGNATURE:

@@ -335,7 +335,7 @@ def change_pbf(rng: random.Random, data: bytes, inner: Inner) -> bytes:
     while at < len(data):
         (size,) = struct.unpack_from(">I", data, at)
         head = data[at + 4 : at + 4 + size]
-        fields = dict(_fields(head))
+        fields = dict(read_fields(head))
         end = at + 4 + size + int(fields[3])
         blocks.append((fields[1], data[at + 4 + size : end]))
         at = end
@@ -343,7 +343,7 @@ def change_pbf(rng: random.Random, data: bytes, inner: Inner) -> bytes:
     parts = []
     for number, (kind, blob) in enumerate(blocks):
         if number == chosen:
-            fields = dict(_fields(blob))
+            fields = dict(read_fields(blob))
             content = inner(rng, fields[1] if 1 in fields else zlib.decompress(fields[3]))
             blob = b"\x10" + _varint(len(content)) + _bytes_field(3, zlib.compress(content))
         head = _bytes_field(1, kind) + b"\x18" + _varint(len(blob))
@@ -353,7 +353,7 @@ def change_pbf(rng: random.Random, data: bytes, inner: Inner) -> bytes:
 
 def change_protobuf(rng: random.Random, data: bytes) -> bytes:
     """Change a field of a message of protocol buffers, or of one inside it."""
-    fields = list(_fields(data))
+    fields = list(read_fields(data))
     if not fields:
         return data
     chosen = rng.randrange(len(fields))
@@ -375,7 +375,7 @@ def change_protobuf(rng: random.Random, data: bytes) -> bytes:
     return b"".join(parts)
 
 
-def _fields(data: bytes) -> Iterator[tuple[int, Any]]:
+def read_fields(data: bytes) -> Iterator[tuple[int, Any]]:
     """Yield number and value of the fields of a message; ValueError for what has other kinds of fields."""
     at = 0
     while at < len(data):
