@@ -111,16 +111,8 @@ def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], stor
             "COLUMNS": "160",
         }
         tempfile.tempdir = None
-        _limit()
-        if arguments[0] == read_tracks.VERB:
-            read_tracks.main(arguments[1:])
-        elif arguments[0] == read_signals.VERB:
-            read_signals.main(arguments[1:])
-        else:
-            sys.argv = ["egvs", *arguments]
-            from egvs.cli.app import main
-
-            main()
+        limit_process()
+        command_line(arguments)
         code = 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
@@ -133,8 +125,21 @@ def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], stor
         os._exit(code)
 
 
-def _limit() -> None:
-    """Of address space, files and dumps."""
+def command_line(arguments: Sequence[str]) -> None:
+    """``egvs ARGUMENTS`` in this process, or a reader in place of a verb."""
+    if arguments[0] == read_tracks.VERB:
+        read_tracks.main(arguments[1:])
+    elif arguments[0] == read_signals.VERB:
+        read_signals.main(arguments[1:])
+    else:
+        sys.argv = ["egvs", *arguments]
+        from egvs.cli.app import main
+
+        main()
+
+
+def limit_process() -> None:
+    """Limit address space, files and dumps of this process."""
     mine = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
     most = mine + _ADDRESSES
     for what, limit in ((resource.RLIMIT_AS, most), (resource.RLIMIT_FSIZE, _MOST_WRITTEN), (resource.RLIMIT_CORE, 0)):
@@ -196,7 +201,7 @@ class Bench:
         self._lay()
         (self._case / file.relative_to(self._base)).write_bytes(data)
         ended = run(self._case, self.kind.verb, self.kind.store)
-        verdict = _fault_of(ended) or self._answer(ended, file, data)
+        verdict = fault_of(ended) or self._answer(ended, file, data)
         return replace(verdict, peak_bytes=ended.peak_bytes, busy_s=ended.busy_s)
 
     def _answer(self, ended: Ended, file: Path, data: bytes) -> Verdict:
@@ -205,16 +210,7 @@ class Bench:
             return self._ranking(ended, file, data)
         if ended.code == 1 and self.kind.simulated and last.startswith("egvs: scenario/scenario.toml: traffic"):
             return self._if_it_says_something_else(file, data, Verdict("unkept", last[:300]))
-        if ended.code != 2:
-            return Verdict(f"exit code {ended.code}", last[:300])
-        if len(ended.err) > _LONGEST_MESSAGE:
-            return Verdict("long message", last[:300])
-        said = ended.err + ended.out
-        if not self.kind.names_others and file.name not in said and _ROW.search(said) is None:
-            return Verdict("file not named", (last or ended.out)[:300])
-        if match := _TEMPORARY.search(said):
-            return Verdict("names a temporary file", said[max(0, match.start() - 200) : match.end() + 100])
-        return Verdict("refused", (last or ended.out)[:300])
+        return refused(self.kind, file, ended)
 
     def _ranking(self, ended: Ended, file: Path, data: bytes) -> Verdict:
         try:
@@ -247,7 +243,22 @@ class Bench:
         ]
 
 
-def _fault_of(ended: Ended) -> Verdict | None:
+def refused(kind: Kind, file: Path, ended: Ended) -> Verdict:
+    """The verdict of a message: one that names the user's file, and ends with the right code."""
+    last = next((line for line in reversed(ended.err.splitlines()) if line.strip()), "")
+    if ended.code != 2:
+        return Verdict(f"exit code {ended.code}", last[:300])
+    if len(ended.err) > _LONGEST_MESSAGE:
+        return Verdict("long message", last[:300])
+    said = ended.err + ended.out
+    if not kind.names_others and file.name not in said and _ROW.search(said) is None:
+        return Verdict("file not named", (last or ended.out)[:300])
+    if match := _TEMPORARY.search(said):
+        return Verdict("names a temporary file", said[max(0, match.start() - 200) : match.end() + 100])
+    return Verdict("refused", (last or ended.out)[:300])
+
+
+def fault_of(ended: Ended) -> Verdict | None:
     """What is a fault whatever the file was."""
     lines = (ended.err + ended.out).splitlines()
     last = next((line for line in reversed(lines) if line.strip()), "")[:300]
