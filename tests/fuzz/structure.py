@@ -119,11 +119,11 @@ def change_json(rng: random.Random, data: bytes) -> bytes:
 
 def _changed_value(rng: random.Random, value: Any) -> Any:
     """Change a member somewhere inside of a value."""
-    holders = list(_holders(value))
-    if not holders:
+    places = list(holders(value))
+    if not places:
         return rng.choice(_HOSTILE_VALUES)
-    holder, key = rng.choice(holders)
-    other_holder, other = rng.choice(holders)
+    holder, key = rng.choice(places)
+    other_holder, other = rng.choice(places)
     match rng.randrange(7):
         case 0:
             del holder[key]
@@ -140,12 +140,12 @@ def _changed_value(rng: random.Random, value: Any) -> Any:
     return value
 
 
-def _holders(value: Any) -> Iterator[tuple[Any, Any]]:
+def holders(value: Any) -> Iterator[tuple[Any, Any]]:
     """Yield each list or dictionary inside of a value with each of its keys."""
     keys = value.keys() if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
     for key in keys:
         yield value, key
-        yield from _holders(value[key])
+        yield from holders(value[key])
 
 
 # ---- tables
