@@ -253,7 +253,7 @@ _ALL = (
     _tracks("tracks.csv", bases.mapped_tracks(False), meaning.table, "", "mapping"),
     _tracks("tracks.jsonl", bases.mapped_tracks(True), meaning.json_lines, "", "mapping"),
     Kind("track columns.toml", "columns.toml", bases.named_columns, meaning.toml,
-         verb=(read_tracks.VERB, "tracks.csv", "columns.toml"), results=(read_tracks.RESULT,)),
+         verb=(read_tracks.VERB, "tracks.csv", "columns.toml"), results=(read_tracks.RESULT,), names_others=True),
     _labels("openlabel", meaning.lenient_json), _labels("dair", meaning.lenient_json),
     _labels("kitti", meaning.words), _labels("csv", meaning.rows),
     _signals("states.csv", meaning.table, "groups.csv"), _signals("lights.csv", meaning.table, "light_groups.csv"),
