@@ -1,10 +1,10 @@
 """Runs the command line on many mutants in one process, which costs a tenth of a process for each.
 
 A process is forked for each kind of file; it calls the command line again and again, with a limit of memory. A mutant
-that ends the process, by a crash, by memory or by time, is a fault, and another process goes on behind it. Where a kind
-is read by ``egvs run``, ``egvs check`` reads it here: it opens the same files and applies every rule to them.
+that ends the process, by a crash, by memory or by time, is a fault, and another process goes on behind it. What
+``egvs check`` reads, too, is read by it instead of ``egvs run``.
 
-What it tells of rankings is nothing; mutants that are read as something else are the matter of :mod:`tests.fuzz.cases`.
+Rankings are not compared; :mod:`tests.fuzz.cases` compares them.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def _work(kind: Kind, folder: Path, seed: int, numbers: Sequence[int], write_end
         cases.limit_process()
         files = sorted(folder.glob(kind.file))
         sound = {file: file.read_bytes() for file in files}
-        verb = ("check", *kind.verb[1:2]) if kind.verb[0] == "run" else kind.verb
+        verb = ("check", *kind.verb[1:2]) if kind.checked else kind.verb
         existing = {path.name for path in folder.iterdir()}
         first, out, err = _call(verb)
         assert first == 0, (kind.name, first, out, err)

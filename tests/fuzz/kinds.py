@@ -44,6 +44,8 @@ class Kind:
         Whether exit code 1 is an answer: files differ.
     simulated
         Whether traffic is, of which a scenario promises something.
+    checked
+        Whether ``egvs check`` reads it, too.
     """
 
     name: str
@@ -57,17 +59,19 @@ class Kind:
     names_others: bool = False
     may_differ: bool = False
     simulated: bool = False
+    checked: bool = False
 
 
 def _input(name: str, file: str, make: Callable[[Path], None], reads: Meaning, names_others: bool = False) -> Kind:
     """A file in the scenario's folder, and a whole run."""
-    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others)
+    checked = not name.startswith("scan.")  # measured scans are compared with the world by a run only
+    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others, checked=checked)
 
 
 def _simulated(name: str, file: str, make: Callable[[Path], None], names_others: bool = False) -> Kind:
     """What SUMO reads a copy of."""
     reads = meaning.gzipped(meaning.xml)
-    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others, simulated=True)
+    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others, simulated=True, checked=True)
 
 
 def _artefact(name: str, verb: str) -> Kind:

@@ -85,6 +85,33 @@ for fault, line in {FAULTS!r}.items():
 
 @pytest.mark.slow
 @pytest.mark.system
+def test_faults_in_process_get_their_verdicts(tmp_path: Path) -> None:
+    """A mutant that ends the process is a fault, and the next ones are read by another process."""
+    code = f"""
+import os, sys
+from pathlib import Path
+from tests.fuzz import cases, in_process
+from tests.fuzz.kinds import KINDS
+faults = {{"traceback": "raise ZeroDivisionError", "the process ended with -6": "os.abort()",
+          "out of time": "while True: pass", "file not named": "sys.exit(2)", "memory": "bytearray(b'1') * (60 << 20)",
+          "read": "pass"}}
+in_process.MOST_SECONDS, in_process.MOST_BYTES = 0.5, 50 << 20
+for number, (fault, line) in enumerate(faults.items()):
+    def command_line(arguments, calls=[]):
+        calls.append(arguments)
+        if len(calls) > 1:  # the first reads the file as it was
+            exec(line)
+    cases.command_line = command_line
+    folder = Path({str(tmp_path)!r}) / str(number)
+    verdicts = [verdict.name for _, verdict in in_process.judge_all(KINDS["sites.csv"], folder, 1, range(2))]
+    assert verdicts == [fault] * 2, (fault, verdicts)
+"""
+    done = python(code)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.system
 def test_killed_runs_reproduce_same_bytes() -> None:
     """A run, a new scenario, a plan and an export."""
     done = python(FUZZ, "--kills", 4)
