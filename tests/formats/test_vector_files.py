@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -166,6 +167,17 @@ def test_pipes_named_like_parts_of_a_file_are_rejected(located: Path, name: str,
     os.mkfifo(located / part)
     with pytest.raises(InputError, match=rf"{part}: expected a file, got a pipe or a device"):
         candidates(located, name)
+
+
+@pytest.mark.parametrize("suffix", ["gpkg", "parquet"])
+def test_coordinates_that_are_not_finite_give_no_warning(tmp_path: Path, suffix: str) -> None:
+    """The readers of features report them, with the number of the feature."""
+    path = tmp_path / f"houses.{suffix}"
+    with np.errstate(invalid="ignore"):
+        ring = shapely.Polygon([(0, 0), (4, 0), (4, float("nan")), (0, 4)])
+        write(path, geopandas.GeoDataFrame({"height_m": [6.0]}, geometry=[ring], crs="EPSG:25832"))
+    (feature,) = vector_files.read_gis_file(path, "Polygon")["features"]
+    assert not np.isfinite(feature["geometry"]["coordinates"]).all()
 
 
 def test_geometries_other_than_points_are_rejected(located: Path) -> None:

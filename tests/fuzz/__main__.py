@@ -1,5 +1,8 @@
 """``python -m tests.fuzz [--cases N] [--seed S] [--kinds A,B]``: mutants of every kind of file, judged one by one.
 
+``python -m tests.fuzz --in-process``: many mutants in one process, a tenth of the time for each; their rankings are not
+compared.
+
 ``python -m tests.fuzz --kills N``: runs that are killed at random moments, and run again.
 
 Every verdict is a line of ``results.jsonl`` in the folder ``--keep``; mutants that fare badly lie beside it. A fuzzer
@@ -15,18 +18,19 @@ import random
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
-from tests.fuzz import cases, kills
+from tests.fuzz import cases, in_process, kills
 from tests.fuzz.cases import Bench, Verdict
-from tests.fuzz.kinds import KINDS
+from tests.fuzz.kinds import KINDS, Kind
 from tests.fuzz.mutating import mutant
 
 _RESULTS = "results.jsonl"
 Results = Counter[tuple[str, str]]
 
 
-def fuzz(kinds: list[str], number: int, seed: int, keep: Path) -> Results:
+def fuzz(kinds: list[str], number: int, seed: int, keep: Path, in_one: bool = False) -> Results:
     """``number`` mutants, shared out evenly; how many of each kind got each verdict."""
     keep.mkdir(parents=True, exist_ok=True)
     done = _done(keep / _RESULTS, seed)
@@ -37,11 +41,14 @@ def fuzz(kinds: list[str], number: int, seed: int, keep: Path) -> Results:
             share = range(number // len(kinds) + (index < number % len(kinds)))
             if not (left := [case for case in share if (kind, case) not in done]):
                 continue
-            bench = Bench(KINDS[kind], Path(temporary) / f"kind{index}")
-            for case in left:
-                verdict = _judge(bench, seed, case, keep)
+            folder = Path(temporary) / f"kind{index}"
+            judge = in_process.judge_all if in_one else _judge_all
+            for case, verdict in judge(KINDS[kind], folder, seed, left):
+                if verdict.name not in (*cases.WELL, *in_process.WELL):
+                    _keep_bad(KINDS[kind], folder, seed, case, verdict, keep)
                 counts[kind, verdict.name] += 1
-                line = {"seed": seed, "kind": kind, "case": case, "verdict": verdict.name, "told": verdict.told}
+                line = {"seed": seed, "kind": kind, "case": case, "verdict": verdict.name, "told": verdict.told,
+                        "busy_s": round(verdict.busy_s, 2), "peak_mb": round(verdict.peak_bytes / 1e6)}  # fmt: skip
                 results.write(json.dumps(line) + "\n")
                 results.flush()
             print(f"{kind}: {_told(counts, kind)}", flush=True)
@@ -56,16 +63,30 @@ def _done(path: Path, seed: int) -> dict[tuple[str, int], str]:
     return {(line["kind"], line["case"]): line["verdict"] for line in lines if line["seed"] == seed}
 
 
-def _judge(bench: Bench, seed: int, case: int, keep: Path) -> Verdict:
-    rng = random.Random(f"{seed}/{bench.kind.name}/{case}")
-    file = rng.choice(bench.files)
-    data = mutant(rng, file.read_bytes())
-    verdict = bench.judge(file, data)
-    if verdict.name not in cases.WELL:
-        path = keep / f"{bench.kind.name.replace(' ', '_')}-{seed}-{case}-{file.name}"
-        path.write_bytes(data)
-        print(f"  {verdict.name}: {path}: {verdict.told}", flush=True)
-    return verdict
+def _judge_all(kind: Kind, folder: Path, seed: int, numbers: list[int]) -> Iterator[tuple[int, Verdict]]:
+    """Yield the verdict of each mutant, read by a process of its own."""
+    bench = Bench(kind, folder)
+    for case in numbers:
+        rng = random.Random(f"{seed}/{kind.name}/{case}")
+        file = rng.choice(bench.files)
+        yield case, bench.judge(file, mutant(rng, file.read_bytes()))
+
+
+def _keep_bad(kind: Kind, folder: Path, seed: int, case: int, verdict: Verdict, keep: Path) -> None:
+    """Write a mutant that fared badly beside the results."""
+    rng = random.Random(f"{seed}/{kind.name}/{case}")
+    file = rng.choice(sorted((folder / "base").glob(kind.file)))
+    path = keep / f"{kind.name.replace(' ', '_').replace('/', '_')}-{seed}-{case}-{file.name}"
+    path.write_bytes(mutant(rng, file.read_bytes()))
+    print(f"  {verdict.name}: {path}: {verdict.told}", flush=True)
+
+
+def _worst(path: Path, seed: int) -> str:
+    """The case that worked longest, and the one with the largest memory."""
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    lines = [line for line in lines if line["seed"] == seed and "busy_s" in line]
+    worst = {key: max(lines, key=lambda line: float(line[key])) for key in ("busy_s", "peak_mb") if lines}
+    return "; ".join(f"most {key}: {line[key]} ({line['kind']}, case {line['case']})" for key, line in worst.items())
 
 
 def _told(counts: Results, kind: str) -> str:
@@ -88,6 +109,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--kinds", default="", help=f"some of: {', '.join(KINDS)}; all by default")
     parser.add_argument("--keep", type=Path, default=Path("build/fuzz"), help="folder of results and of bad mutants")
+    parser.add_argument("--in-process", action="store_true", help="many mutants in one process; rankings do not count")
     parser.add_argument("--kills", type=int, default=0, help="instead: runs that are killed, and run again")
     given = parser.parse_args()
     if given.kills:
@@ -95,7 +117,7 @@ def main() -> int:
     kinds = [name.strip() for name in given.kinds.split(",") if name.strip()] or list(KINDS)
     if unknown := [name for name in kinds if name not in KINDS]:
         parser.error(f"unknown kinds {', '.join(unknown)}; some of: {', '.join(KINDS)}")
-    counts = fuzz(kinds, given.cases, given.seed, given.keep)
+    counts = fuzz(kinds, given.cases, given.seed, given.keep, given.in_process)
     verdicts = Counter[str]()
     for (_, verdict), count in counts.items():
         verdicts[verdict] += count
@@ -103,7 +125,8 @@ def main() -> int:
         f"{sum(verdicts.values())} mutants of {len(kinds)} kinds: "
         + ", ".join(f"{n} {v}" for v, n in verdicts.most_common())
     )
-    return int(any(verdict not in cases.WELL for verdict in verdicts))
+    print(_worst(given.keep / _RESULTS, given.seed))
+    return int(any(verdict not in (*cases.WELL, *in_process.WELL) for verdict in verdicts))
 
 
 if __name__ == "__main__":

@@ -151,6 +151,70 @@ def routed(folder: Path) -> None:
     _simulated(folder, 'network = "net.net.xml"\nroutes = ["own.rou.xml"]')
 
 
+_PHASES = """phase,approach,movement,green_s
+1,south,all,20
+1,north,all,20
+2,east,all,15
+2,west,all,15
+"""
+
+
+def signalled(name: str):
+    """A plan of signals in a file: a table, or a program of SUMO."""
+
+    def make(folder: Path) -> None:
+        made = _simulated(folder, 'network = "net.net.xml"')
+        text = (made / "scenario.toml").read_text()
+        (made / "scenario.toml").write_text(
+            text.replace("[[traffic.kinds]]", f'[traffic.signals.A0]\nfile = "{name}"\n\n[[traffic.kinds]]')
+        )
+        program = re.search(rb"<tlLogic.*?</tlLogic>", network(), flags=re.DOTALL)
+        assert program
+        xml = b"<additional>\n" + program[0] + b"\n</additional>\n"
+        (made / name).write_bytes(_PHASES.encode() if name.endswith(".csv") else xml)
+
+    return make
+
+
+def observed(folder: Path) -> None:
+    """Counts, and what was observed of queues and speeds."""
+    made = _simulated(folder, 'network = "net.net.xml"')
+    counts = "".join(
+        f'[[traffic.counts]]\nedge = "{edge}"\nper_hour = 300\n\n' for edge in ("left0A0", "top0A0", "right0A0")
+    )
+    text = (made / "scenario.toml").read_text().replace("[traffic]\n", '[traffic]\nobserved = "observed.csv"\n')
+    text = text.replace("vehicles = 3\n", "").replace('hold = "at_most"\n', "")
+    (made / "scenario.toml").write_text(text.replace("[[traffic.kinds]]", counts + "[[traffic.kinds]]"))
+    (made / "observed.csv").write_text("approach,queue_m,speed_kmh\nwest,10,30\nnorth,12.5,\neast,,35\n")
+
+
+def located(name: str):
+    """The crossing in UTM, and sites in a format of GIS programs."""
+
+    def make(folder: Path) -> None:
+        import geopandas
+        from shapely.geometry import Point
+
+        made = _simulated(folder, 'network = "net.net.xml"')
+        (made / "net.net.xml").write_bytes(roads())
+        text = (made / "scenario.toml").read_text()
+        (made / "scenario.toml").write_text(text.replace('"sites.csv"', f'"{name}"'))
+        east_m, north_m = _utm_m(_LAT, _LON)
+        places = [Point(east_m + x, north_m + y) for x, y in ((10, 12), (-12, -12))]
+        values = {"name": ["pole_a", "pole_b"], "z_m": [3.0, 3.0]}
+        frame = geopandas.GeoDataFrame(values, geometry=places, crs="EPSG:32632")
+        (frame.to_parquet if name.endswith("parquet") else frame.to_file)(made / name)
+
+    return make
+
+
+def priced(folder: Path) -> None:
+    """Sites with costs and poles, for a plan."""
+    made = mini(folder, ("[score]", "[placement]\nbudget = 3\n\n[score]"))
+    rows = "pole_a,10,12,3,2,yes\npole_b,30.5,-12,3,1,no\npole_c,20,12,3,1.5,no\n"
+    (made / "sites.csv").write_text("site,x_m,y_m,z_m,cost,owner\n" + rows)
+
+
 def configured(folder: Path) -> None:
     """A configuration of SUMO, with routes and additional files."""
     _simulated(folder, 'sumocfg = "own.sumocfg"')
@@ -218,6 +282,17 @@ def mapped_tracks(json_lines: bool) -> Callable[[Path], None]:
         return write_user_table(folder, boxes, read_tracks.MAPPING, json_lines)
 
     return tracks(write, "car", "pedestrian")
+
+
+def named_columns(folder: Path) -> None:
+    """A network, a user's own table of tracks, and the names of its columns."""
+    boxes = moving_boxes(("car", "pedestrian"), n_frames=20)
+    path = write_user_table(folder, boxes, read_tracks.MAPPING, False)
+    path.rename(folder / "tracks.csv")
+    values = read_tracks.MAPPING.model_dump(exclude_defaults=True, exclude_none=True)
+    lines = [f"{key} = {json.dumps(value)}" for key, value in values.items() if not isinstance(value, dict)]
+    lines += ["[types]", *(f"{key} = {json.dumps(value)}" for key, value in values.get("types", {}).items())]
+    (folder / "columns.toml").write_text("\n".join([*lines, ""]))
 
 
 def signals(folder: Path) -> None:
@@ -335,6 +410,34 @@ def metadata(folder: Path) -> None:
     (made / "metadata.json").write_text(json.dumps(text))
 
 
+def _beam_file(keys: str, text: str):
+    """A sensor of which a file states the beams."""
+    rings = "elevations_deg = [-15, 5]\nchannels = 8\nazimuth_step_deg = 1.0\n"
+
+    def make(folder: Path) -> None:
+        made = mini(folder, (rings, keys))
+        (made / "beams.csv").write_text(text)
+
+    return make
+
+
+ring_table = _beam_file(
+    'beams = "beams.csv"\nazimuth_step_deg = 1.0\n',
+    "elevation_deg,azimuth_offset_deg,vertical_offset_m\n5,1.5,0.02\n-5.5,0,0.01\n-15,-1.5,0\n",
+)
+"""A sensor with a table of rings."""
+
+robosense = _beam_file('beams = "beams.csv"\nazimuth_step_deg = 1.0\n', "5.0,1.5\n-5.5,0.0\n-15.0,-1.5\n")
+"""A sensor with the angles of a RoboSense."""
+
+directions = _beam_file(
+    'pattern = {kind = "file", file = "beams.csv", samples = 3000}\n',
+    "elevation_deg,azimuth_deg,dwell_s\n"
+    + "".join(f"{e},{a},{0.1 + 0.01 * abs(e)}\n" for a in range(0, 360, 6) for e in (-15, -10, -5, 0)),
+)
+"""A sensor whose pattern does not repeat, with the directions of a Livox."""
+
+
 def angles(folder: Path) -> None:
     """A sensor with the angle correction of a Hesai."""
     rings = "elevations_deg = [-15, 5]\nchannels = 8\nazimuth_step_deg = 1.0\n"
@@ -449,6 +552,63 @@ def sweep(name: str):
     return make
 
 
+CARS = np.array([[9.0, 3.0, -2.25, 4.4, 1.8, 1.5, 0.0], [-10.0, -4.0, -2.25, 4.4, 1.8, 1.5, 0.0]])
+"""Boxes of two cars below a sensor 3 m above the ground: centre, size and heading."""
+
+
+def labelled(form: str):
+    """Two sweeps of two cars, and their labels in one format."""
+
+    def make(folder: Path) -> None:
+        from egvs.formats import pcd
+        from tests.extensions.validation.measured import twin
+
+        mini(folder, ("elevations_deg = [-15, 5]\nchannels = 8", "elevations_deg = [-20, -3]\nchannels = 8"))
+        (folder / "labels").mkdir()
+        made = twin.Twin([_sweep_of_cars(0.0), _sweep_of_cars(0.5)], [CARS, CARS + np.eye(7)[0] / 2])
+        (folder / "sweeps").mkdir()
+        for number, points_m in enumerate(made.points_m):
+            pcd.write(folder / "sweeps" / f"sweep{number}.pcd", points_m)
+        if form == "csv":
+            twin.write_table(folder / "labels" / "labels.csv", made)
+        else:
+            write = {"openlabel": twin.write_openlabel, "dair": twin.write_dair, "kitti": twin.write_kitti}[form]
+            write(folder / "labels", made)
+
+    return make
+
+
+def _sweep_of_cars(x_m: float) -> np.ndarray:
+    """Returns of a sensor above level ground with :data:`CARS`, which have moved by ``x_m``."""
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(0.0, 360.0)), np.radians(np.linspace(-20, -3, 8)))
+    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1)
+    rays = rays.reshape(-1, 3)
+    range_m = -3.0 / rays[:, 2]
+    for x, y, z, *size, _ in CARS.tolist():
+        centre, half = np.array([x + x_m, y, z]), np.array(size) / 2
+        with np.errstate(divide="ignore"):
+            near = np.sort(np.stack([(centre - half) / rays, (centre + half) / rays]), axis=0)
+        enters, leaves = near[0].max(axis=1), near[1].min(axis=1)
+        range_m = np.where((enters < leaves) & (enters > 0), np.minimum(range_m, enters), range_m)
+    return rays * range_m[:, None]
+
+
+def binary_sweep(folder: Path) -> None:
+    """A sweep in KITTI's format."""
+    from tests.extensions.hardware.fit.small_sensor import TRUTH, coarse_sensor, sweep_of
+
+    points = sweep_of(TRUTH, coarse_sensor())
+    points = points[np.isfinite(points[:, 0])]
+    np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(folder / "sweep.bin")
+
+
+def calibrated(folder: Path) -> None:
+    """A sweep, and a calibration of the pose."""
+    sweep("sweep.pcd")(folder)
+    matrix = [[1.0, 0.0, 0.0, 5.0], [0.0, 1.0, 0.0, 7.0], [0.0, 0.0, 1.0, 6.0], [0.0, 0.0, 0.0, 1.0]]
+    (folder / "calibration.json").write_text(json.dumps({"transformation_matrix_into_map": matrix}))
+
+
 # ---- maps
 
 
@@ -481,6 +641,30 @@ def lanelets(name: str):
             path.unlink()
 
     return make
+
+
+def projected(folder: Path) -> None:
+    """The same, and the projection of a map of Autoware beside it."""
+    lanelets("lanelets.osm")(folder)
+    origin = "  latitude: 49.0\n  longitude: 8.4\n  altitude: 0.0\n"
+    text = f"projector_type: LocalCartesian\nvertical_datum: WGS84\nmap_origin:\n{origin}"
+    (folder / "map_projector_info.yaml").write_text(text)
+
+
+def counted(folder: Path) -> None:
+    """An extract of a map, and counts of its junction."""
+    extract("map.osm")(folder)
+    rows = [f"{side},{start},{60 + number}" for number, side in enumerate("NSEW") for start in ("07:00", "07:15")]
+    (folder / "counts.csv").write_text("\n".join(["approach,start,count", *rows, ""]))
+
+
+def surfaced(folder: Path) -> None:
+    """The crossing with its terrain and a house without a height, and a surface model that has it."""
+    on_terrain("terrain.asc")(folder)
+    vectors("houses.geojson", height=None)(folder)
+    text = (folder / "terrain.asc").read_text()
+    (folder / "surface.asc").write_text(re.sub(r"\b(4\d)\.", lambda match: f"{int(match[1]) + 9}.", text))
+    shutil.copyfile(folder / "terrain.prj", folder / "surface.prj")
 
 
 _LAT, _LON = 52.0, 10.0
@@ -595,7 +779,7 @@ def on_terrain(name: str):
     return make
 
 
-def vectors(name: str):
+def vectors(name: str, height: float | None = 8.5):
     """The crossing, and beside it the outline of a house in a format of GIS programs."""
 
     def make(folder: Path) -> None:
@@ -605,7 +789,7 @@ def vectors(name: str):
         (folder / "roads.net.xml").write_bytes(roads())
         east_m, north_m = _utm_m(_LAT, _LON)
         outline = box(east_m + 20, north_m + 20, east_m + 32, north_m + 30)
-        frame = geopandas.GeoDataFrame({"name": ["h"], "height": [8.5]}, geometry=[outline], crs="EPSG:32632")
+        frame = geopandas.GeoDataFrame({"name": ["h"], "height": [height]}, geometry=[outline], crs="EPSG:32632")
         if name.endswith("parquet"):
             frame.to_parquet(folder / name)
         elif name.endswith("kml"):

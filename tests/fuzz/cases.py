@@ -26,7 +26,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import CodeType
@@ -49,6 +49,10 @@ _LONGEST_MESSAGE = 4000
 _ROW = re.compile(r"\bsite '?[^\s:']+'?(?: and \d+ more)?:")
 """A message may name a row, a site, in place of the file that it stands in."""
 
+_TEMPORARY = re.compile(r"(?:\.tmp|\.pending)/")
+"""In a message: a file that the user does not know."""
+_PYTHON_WARNING = re.compile(r"^\S+:\d+: \w*Warning: ", re.MULTILINE)
+
 _SCORES = ("egvs", "egvs_limit", "rank", "entropy_seen")
 _NO_VEHICLE = ("no vehicle in the region", "so there is no ranking")
 _OF_VEHICLES = ("expected_detections", "points_on_target", "seen_well")
@@ -57,20 +61,26 @@ WELL = ("refused", "same", "legal", "unkept")
 
 @dataclass(frozen=True)
 class Ended:
-    """How the command line ended: its exit code (below 0: a signal; None: out of time), what it printed, its peak."""
+    """How the command line ended: exit code (below 0: a signal; None: out of time), what it printed, and what it took.
+
+    ``peak_bytes`` is the largest resident memory of one of its processes, ``busy_s`` the processor time of all.
+    """
 
     code: int | None
     out: str
     err: str
     peak_bytes: int
+    busy_s: float
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """``name`` is one of WELL, or the fault; ``told`` the line that says most of it."""
+    """``name`` is one of WELL, or the fault; ``told`` the line that says most of it; and what the case took."""
 
     name: str
     told: str = ""
+    peak_bytes: int = 0
+    busy_s: float = 0.0
 
 
 def run(folder: Path, arguments: Sequence[str], store: bool = False) -> Ended:
@@ -81,9 +91,9 @@ def run(folder: Path, arguments: Sequence[str], store: bool = False) -> Ended:
     sys.stderr.flush()
     if not (child := os.fork()):
         become(folder, arguments, printed, store)
-    code, peak = _wait(child)
+    code, peak, busy_s = _wait(child)
     out, err = (path.read_text(errors="replace") for path in printed)
-    return Ended(code, out, err, peak)
+    return Ended(code, out, err, peak, busy_s)
 
 
 def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], store: bool) -> None:
@@ -101,16 +111,8 @@ def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], stor
             "COLUMNS": "160",
         }
         tempfile.tempdir = None
-        _limit()
-        if arguments[0] == read_tracks.VERB:
-            read_tracks.main(arguments[1:])
-        elif arguments[0] == read_signals.VERB:
-            read_signals.main(arguments[1:])
-        else:
-            sys.argv = ["egvs", *arguments]
-            from egvs.cli.app import main
-
-            main()
+        limit_process()
+        command_line(arguments)
         code = 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)
@@ -123,16 +125,29 @@ def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], stor
         os._exit(code)
 
 
-def _limit() -> None:
-    """Of address space, files and dumps."""
+def command_line(arguments: Sequence[str]) -> None:
+    """``egvs ARGUMENTS`` in this process, or a reader in place of a verb."""
+    if arguments[0] == read_tracks.VERB:
+        read_tracks.main(arguments[1:])
+    elif arguments[0] == read_signals.VERB:
+        read_signals.main(arguments[1:])
+    else:
+        sys.argv = ["egvs", *arguments]
+        from egvs.cli.app import main
+
+        main()
+
+
+def limit_process() -> None:
+    """Limit address space, files and dumps of this process."""
     mine = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
     most = mine + _ADDRESSES
     for what, limit in ((resource.RLIMIT_AS, most), (resource.RLIMIT_FSIZE, _MOST_WRITTEN), (resource.RLIMIT_CORE, 0)):
         resource.setrlimit(what, (limit, limit))
 
 
-def _wait(child: int) -> tuple[int | None, int]:
-    """Exit code and peak of a child, which is killed when its time is over."""
+def _wait(child: int) -> tuple[int | None, int, float]:
+    """Exit code, peak and processor time of a child, which is killed when its time is over."""
     descriptor, last = os.pidfd_open(child), time.monotonic() + _MOST_WAITING
     try:
         while not (ready := select.select([descriptor], [], [], 1.0)[0]):
@@ -146,7 +161,8 @@ def _wait(child: int) -> tuple[int | None, int]:
     _, status, used = os.wait4(child, 0)
     with suppress(ProcessLookupError):  # SUMO ends with it, but later
         os.killpg(child, signal.SIGKILL)
-    return os.waitstatus_to_exitcode(status) if ready else None, used.ru_maxrss * 1024
+    code = os.waitstatus_to_exitcode(status) if ready else None
+    return code, used.ru_maxrss * 1024, used.ru_utime + used.ru_stime
 
 
 def _busy_s(process: int) -> float:
@@ -185,7 +201,8 @@ class Bench:
         self._lay()
         (self._case / file.relative_to(self._base)).write_bytes(data)
         ended = run(self._case, self.kind.verb, self.kind.store)
-        return _fault_of(ended) or self._answer(ended, file, data)
+        verdict = fault_of(ended) or self._answer(ended, file, data)
+        return replace(verdict, peak_bytes=ended.peak_bytes, busy_s=ended.busy_s)
 
     def _answer(self, ended: Ended, file: Path, data: bytes) -> Verdict:
         last = next((line for line in reversed(ended.err.splitlines()) if line.strip()), "")
@@ -193,14 +210,7 @@ class Bench:
             return self._ranking(ended, file, data)
         if ended.code == 1 and self.kind.simulated and last.startswith("egvs: scenario/scenario.toml: traffic"):
             return self._if_it_says_something_else(file, data, Verdict("unkept", last[:300]))
-        if ended.code != 2:
-            return Verdict(f"exit code {ended.code}", last[:300])
-        if len(ended.err) > _LONGEST_MESSAGE:
-            return Verdict("long message", last[:300])
-        said = ended.err + ended.out
-        if not self.kind.names_others and file.name not in said and _ROW.search(said) is None:
-            return Verdict("file not named", (last or ended.out)[:300])
-        return Verdict("refused", (last or ended.out)[:300])
+        return refused(self.kind, file, ended)
 
     def _ranking(self, ended: Ended, file: Path, data: bytes) -> Verdict:
         try:
@@ -233,7 +243,22 @@ class Bench:
         ]
 
 
-def _fault_of(ended: Ended) -> Verdict | None:
+def refused(kind: Kind, file: Path, ended: Ended) -> Verdict:
+    """The verdict of a message: one that names the user's file, and ends with the right code."""
+    last = next((line for line in reversed(ended.err.splitlines()) if line.strip()), "")
+    if ended.code != 2:
+        return Verdict(f"exit code {ended.code}", last[:300])
+    if len(ended.err) > _LONGEST_MESSAGE:
+        return Verdict("long message", last[:300])
+    said = ended.err + ended.out
+    if not kind.names_others and file.name not in said and _ROW.search(said) is None:
+        return Verdict("file not named", (last or ended.out)[:300])
+    if match := _TEMPORARY.search(said):
+        return Verdict("names a temporary file", said[max(0, match.start() - 200) : match.end() + 100])
+    return Verdict("refused", (last or ended.out)[:300])
+
+
+def fault_of(ended: Ended) -> Verdict | None:
     """What is a fault whatever the file was."""
     lines = (ended.err + ended.out).splitlines()
     last = next((line for line in reversed(lines) if line.strip()), "")[:300]
@@ -245,6 +270,8 @@ def _fault_of(ended: Ended) -> Verdict | None:
         return Verdict(
             "traceback", next((line for line in reversed(ended.err.splitlines()) if line.strip()), last)[:300]
         )
+    if match := _PYTHON_WARNING.search(ended.err):
+        return Verdict("warning of Python", ended.err[match.start() :][:300])
     if ended.peak_bytes > MOST_BYTES:
         return Verdict("memory", f"{ended.peak_bytes / 2**30:.1f} GB; {last}")
     return None

@@ -44,6 +44,8 @@ class Kind:
         Whether exit code 1 is an answer: files differ.
     simulated
         Whether traffic is, of which a scenario promises something.
+    checked
+        Whether ``egvs check`` reads it, too.
     """
 
     name: str
@@ -57,17 +59,19 @@ class Kind:
     names_others: bool = False
     may_differ: bool = False
     simulated: bool = False
+    checked: bool = False
 
 
 def _input(name: str, file: str, make: Callable[[Path], None], reads: Meaning, names_others: bool = False) -> Kind:
     """A file in the scenario's folder, and a whole run."""
-    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others)
+    checked = not name.startswith("scan.")  # measured scans are compared with the world by a run only
+    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others, checked=checked)
 
 
 def _simulated(name: str, file: str, make: Callable[[Path], None], names_others: bool = False) -> Kind:
     """What SUMO reads a copy of."""
     reads = meaning.gzipped(meaning.xml)
-    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others, simulated=True)
+    return Kind(name, f"scenario/{file}", make, reads, names_others=names_others, simulated=True, checked=True)
 
 
 def _artefact(name: str, verb: str) -> Kind:
@@ -144,6 +148,14 @@ def _signals(file: str, reads: Meaning, *others: str) -> Kind:
     return Kind(f"signals {file}", f"signals/{file}", bases.signals, reads, verb=verb, results=(read_signals.RESULT,))
 
 
+def _labels(form: str, reads: Meaning) -> Kind:
+    """Labels of measured sweeps."""
+    verb = ("validate", "scenario", "--against", "sweeps", "--labels", "labels", "--sensor", "small", "--detector",
+            "points", "--out", "made", *(("--columns", "type=class,x_m=cx") if form == "csv" else ()))  # fmt: skip
+    made = ("made/against.json",)
+    return Kind(f"labels {form}", "labels/*", bases.labelled(form), reads, verb=verb, results=made)
+
+
 _IND = bases.tracks(writers.write_levelx, "car", "pedestrian")
 _HIGHD = bases.tracks(writers.write_highd, "car", "truck", straight=True)
 _TAF_BW = bases.tracks(writers.write_taf_bw, "car", "pedestrian")
@@ -175,6 +187,16 @@ _ALL = (
     _input("beams.csv", "beams.csv", bases.beams, meaning.rows),
     _input("metadata.json", "metadata.json", bases.metadata, meaning.text_json),
     _input("angles.csv", "angles.csv", bases.angles, meaning.rows),
+    _input("rings.csv", "beams.csv", bases.ring_table, meaning.rows),
+    _input("robosense.csv", "beams.csv", bases.robosense, meaning.rows),
+    _input("directions.csv", "beams.csv", bases.directions, meaning.rows),
+    *(_input(f"sites.{form}", f"sites.{form}", bases.located(f"sites.{form}"), meaning.bytes_themselves)
+      for form in ("gpkg", "shp", "parquet")),
+    Kind("sites.csv place", "scenario/sites.csv", bases.priced, meaning.rows, (_RUN,),
+         ("place", "scenario", "--out", "out"), ("out/placement.parquet",)),
+    _simulated("signals.csv", "signals.csv", bases.signalled("signals.csv")),
+    _simulated("signals.xml", "signals.xml", bases.signalled("signals.xml")),
+    _simulated("observed.csv", "observed.csv", bases.observed),
     _input("scan.csv", "points.csv", bases.measured("points.csv"), meaning.rows),
     _input("scan.las", "points.las", bases.measured("points.las"), meaning.bytes_themselves),
     _input("scan.laz", "points.laz", bases.measured("points.laz"), meaning.bytes_themselves),
@@ -183,13 +205,22 @@ _ALL = (
     _input("scan.ply binary", "binary.ply", bases.measured("binary.ply"), meaning.ply),
     _input("scan.pcd", "points.pcd", bases.measured("points.pcd"), meaning.pcd),
     _input("scan.pcd binary", "binary.pcd", bases.measured("binary.pcd"), meaning.pcd),
+    Kind("new counts.csv", "counts.csv", bases.counted, meaning.rows, results=("made/scenario.toml", "made/sites.csv"),
+         verb=("new", "made", "--osm", "map.osm", "--counts", "counts.csv")),
+    Kind("new map_projector_info.yaml", "map_projector_info.yaml", bases.projected, meaning.bytes_themselves,
+         verb=("new", "made", "--from", "lanelets.osm", "--vehicles-per-hour", "200"),
+         results=("made/network.net.xml", "made/sites.csv"), names_others=True),
+    Kind("new surface.asc", "surface.asc", bases.surfaced, meaning.bytes_themselves,
+         verb=("new", "made", "--from", "roads.net.xml", "terrain.asc", "houses.geojson", "--surface", "surface.asc",
+               "--vehicles-per-hour", "200"), results=("made/statics.geojson",)),
     _new("map.osm", meaning.gzipped(meaning.xml)), _new("map.osm.gz", meaning.gzipped(meaning.xml)),
     _new("map.osm.pbf", meaning.bytes_themselves), _lanelets("lanelets.osm"), _lanelets("lanelets.osm.gz"),
     _beside("city.gml", meaning.bytes_themselves), _beside("dem.gml", meaning.bytes_themselves),
     _beside("city.json", meaning.text_json), _beside("houses.geojson", meaning.text_json),
     _road_map("roads.net.xml", meaning.bytes_themselves), _road_map("roads.xodr", meaning.bytes_themselves),
     *(_beside(f"houses.{form}", meaning.bytes_themselves, bases.vectors) for form in ("gpkg", "shp", "kml", "parquet")),
-    _beside("houses.shp", meaning.bytes_themselves, bases.vectors, "houses.dbf"),
+    *(_beside("houses.shp", meaning.bytes_themselves, bases.vectors, f"houses.{form}")
+      for form in ("dbf", "shx", "prj", "cpg")),
     *(_beside(f"terrain.{form}", meaning.bytes_themselves, bases.on_terrain) for form in ("asc", "tif", "xml")),
     _beside("terrain.asc", meaning.bytes_themselves, bases.on_terrain, "terrain.prj"),
     *(_beside(f"survey.{form}", reads, bases.surveyed) for form, reads in (
@@ -225,8 +256,16 @@ _ALL = (
     _tracks("trace.mcap", bases.tracks(writers_json.write_osi_mcap, "car", "tram"), meaning.bytes_themselves),
     _tracks("tracks.csv", bases.mapped_tracks(False), meaning.table, "", "mapping"),
     _tracks("tracks.jsonl", bases.mapped_tracks(True), meaning.json_lines, "", "mapping"),
+    Kind("track columns.toml", "columns.toml", bases.named_columns, meaning.toml,
+         verb=(read_tracks.VERB, "tracks.csv", "columns.toml"), results=(read_tracks.RESULT,), names_others=True),
+    _labels("openlabel", meaning.lenient_json), _labels("dair", meaning.lenient_json),
+    _labels("kitti", meaning.words), _labels("csv", meaning.rows),
     _signals("states.csv", meaning.table, "groups.csv"), _signals("lights.csv", meaning.table, "light_groups.csv"),
     _signals("groups.csv", meaning.table, "states.csv"), _signals("map.kml", meaning.kml, "states.csv"),
+    Kind("sweep sweep.bin", "sweep.bin", bases.binary_sweep, meaning.bytes_themselves, results=("made/sensor.toml",),
+         verb=("sensor", "fit", "sweep.bin", "--name", "mast", "--out", "made")),
+    Kind("calibration.json", "calibration.json", bases.calibrated, meaning.text_json, results=("made/sensor.toml",),
+         verb=("sensor", "fit", "sweep.pcd", "--name", "mast", "--out", "made", "--calibration", "calibration.json")),
     _sweep("sweep.csv", meaning.rows), _sweep("sweep.pcd", meaning.pcd),
     _recording("sweep.bag"), _recording("sweep.mcap"), _recording("sweep.db3"), _recording("sweep.pcap"),
     _sweep("sweep.ply.gz", meaning.gzipped(meaning.ply)), _sweep("sweep.npz", meaning.bytes_themselves),
@@ -254,3 +293,29 @@ _ALL = (
 
 KINDS = {kind.name: kind for kind in _ALL}
 """By name."""
+
+FORMATS = {
+    "`scenario.toml`": ("scenario.toml", "extended scenario.toml", "city.toml", "track columns.toml"),
+    "JSON, GeoJSON": ("statics.geojson", "sites.geojson", "new city.json", "metadata.json", "labels openlabel"),
+    "polygons of any format": ("poly.xml", "new houses.geojson", "new city.gml"),
+    "tables in CSV": ("sites.csv", "junctions.csv", "new counts.csv", "signals.csv", "observed.csv", "labels csv"),
+    "XML of any kind": ("net.xml", "vtypes.xml", "new city.gml", "new terrain.xml", "new roads.xodr"),
+    "gzip of any file": ("net.xml.gz", "fcd.csv.gz", "new map.osm.gz", "sweep sweep.ply.gz"),
+    "FCD in Parquet": ("fcd.parquet", "fcd.parquet.gz"),
+    "tracks in CSV": ("tracks 07_tracks.csv", "tracks tracks.csv", "tracks 10001.csv"),
+    "tracks in Parquet, Feather": ("tracks scenario_hand-made.parquet", "tracks annotations.feather"),
+    "OpenStreetMap (XML, PBF)": ("new map.osm", "new map.osm.pbf"),
+    "points in CSV, PLY, PCD": ("scan.csv", "scan.ply binary", "scan.pcd binary", "new survey.pcd"),
+    "LAS": ("scan.las", "new survey.las"),
+    "LAZ": ("scan.laz", "new survey.laz"),
+    "E57": ("scan.e57", "new survey.e57"),
+    "meshes": ("mesh.obj", "mesh.stl", "mesh.ply", "mesh.glb", "mesh.gltf", "new house.off"),
+    "GeoPackage, Shapefile, KML": ("new houses.gpkg", "new houses.shp", "new houses.kml", "sites.gpkg", "sites.shp"),
+    "GeoParquet": ("new houses.parquet", "sites.parquet"),
+    "GeoTIFF": ("new terrain.tif",),
+    "ASCII grids": ("new terrain.asc", "new surface.asc"),
+    "sweeps in `.npz`": ("sweep sweep.npz",),
+    "networks, maps and demand for SUMO": ("net.xml", "sumocfg", "add.xml", "new roads.net.xml", "new lanelets.osm"),
+    "route files": ("rou.xml",),
+}
+"""Kinds of each row of the table "Limits by format" in docs/security.md."""

@@ -213,4 +213,5 @@ def pcd(data: bytes) -> object:
     head, mark, body = data.partition(b"DATA ")
     if not mark:
         raise ValueError("has no data")
-    return [line.split() for line in head.decode("ascii").splitlines() if not line.startswith("#")], body
+    lines = [line for line in head.splitlines() if not line.startswith(b"#")]
+    return [line.decode("ascii").split() for line in lines], body

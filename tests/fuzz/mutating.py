@@ -2,7 +2,8 @@
 
 A mutant is one to three changes on top of each other, all drawn from one generator: the same seed, the same mutant.
 Text gets changes that know of numbers, words, lines, brackets and encodings; gzip, zip and E57 are also opened, changed
-inside, and closed again with right checksums, for else no mutant would come further than the checksum.
+inside, and closed again with right checksums, for else no mutant would come further than the checksum. Half of the
+changes know the format of the file (:mod:`tests.fuzz.structure`).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from collections.abc import Callable
 from functools import cache
 
 from tests.formats.e57_pages import with_checksums
+from tests.fuzz import structure
 
 Change = Callable[[random.Random, bytes], bytes]
 
@@ -74,10 +76,32 @@ def _changed(rng: random.Random, data: bytes) -> bytes:
         return _in_zip(rng, data)
     if data.startswith(b"ASTM-E57") and rng.random() < 0.7:
         return _in_e57(rng, data)
+    if rng.random() < 0.5 and (change := structure_change(data)) is not None:
+        try:
+            return change(rng, data)[:_MOST_BYTES]
+        except Exception:  # noqa: BLE001 - an earlier change has broken the format
+            pass
     text = _as_text(data)
     if text is None or rng.random() < 0.25:
         return rng.choice(_ON_BYTES)(rng, data)[:_MOST_BYTES]
     return rng.choice(_ON_TEXT)(rng, text)[:_MOST_BYTES]
+
+
+def structure_change(data: bytes) -> Change | None:
+    """What changes the structure of a file of this format; None where nothing does."""
+    head = data[:2000].lstrip(b"\xef\xbb\xbf \r\n\t")
+    for signs, change in _BY_SIGNATURE:
+        if head.startswith(signs):
+            return change
+    if head.startswith(b"<"):
+        return structure.change_xml
+    if head.startswith((b"{", b"[")):
+        return structure.change_json
+    if b"OSMHeader" in head[:40]:
+        return lambda rng, data: structure.change_pbf(rng, data, structure.change_protobuf)
+    if head.count(b",") + head.count(b";") > 1 and _as_text(data) is not None:
+        return structure.change_table
+    return None
 
 
 def _as_text(data: bytes) -> str | None:
@@ -306,3 +330,12 @@ _ON_TEXT: tuple[Callable[[random.Random, str], bytes], ...] = (
     _number, _number, _number, _number, _number, _word, _word, _word, _line, _line, _line, _sign, _sign, _deep,
     _declared, _entities,
 )  # fmt: skip
+_BY_SIGNATURE: tuple[tuple[bytes | tuple[bytes, ...], Change], ...] = (
+    ((b"PAR1", b"ARROW1"), structure.change_arrow),
+    (b"SQLite format 3\x00", structure.change_sqlite),
+    ((b"II*\x00", b"MM\x00*"), structure.change_tiff),
+    (b"LASF", structure.change_las),
+    (b"glTF", structure.change_glb),
+    ((b"ply", b"# .PCD", b"VERSION"), lambda rng, data: structure.change_head(rng, data, _changed)),
+)
+"""Start of a file, and what changes its structure."""

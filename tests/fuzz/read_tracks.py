@@ -1,6 +1,7 @@
 """Reads a file of recorded tracks in place of a verb, for the fuzzer: the readers alone take far less than a run.
 
-A file is read by the reader that accepts it, or, with the word ``mapping``, by :data:`MAPPING`.
+A file is read by the reader that accepts it, or, with the word ``mapping``, by :data:`MAPPING`,
+or with a TOML file, by the columns that it names.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import pyarrow.parquet as pq
 from egvs.cli import exit
 from egvs.extensions.tracks import sources as track_readers
 from egvs.extensions.tracks import user_table
+from egvs.extensions.tracks.new.files import read_track_columns
 from egvs.scenario.track_columns import TrackColumns
 
 VERB = "read-tracks"
@@ -33,7 +35,9 @@ def main(arguments: Sequence[str]) -> None:
     """Read the first argument and write its boxes; an error ends the process as on the command line."""
     path = Path(arguments[0])
     with exit.report_errors():
-        if "mapping" in arguments:
+        if arguments[-1].endswith(".toml"):
+            tracks = user_table.read(path, read_track_columns(Path(arguments[-1])))
+        elif "mapping" in arguments:
             tracks = user_table.read(path, MAPPING)
         else:
             reader = track_readers.find_reader(path)

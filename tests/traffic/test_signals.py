@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from egvs.core.digests import Digests, use_digests
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.creation import sumo_network
@@ -334,6 +335,14 @@ def test_check_reports_plans_before_the_simulation(crossing, tmp_path):
     setup = scenario_from_dict(values, folder, str(folder / "scenario.toml"))
     with pytest.raises(InputError, match=r"own\.add\.xml of the SUMO configuration also contains signal programs"):
         sumo_folder.prepare_simulation(setup, tmp_path / "sumo")
+
+
+def test_plan_is_no_change_of_a_file_in_use(crossing, tmp_path):
+    """The copy of the network is read to find the signal, and written again: SUMO's input is hashed after that."""
+    setup = scenario(crossing, {"c": {"phases": [NS, EW]}})
+    with use_digests(Digests(tmp_path)) as digests:
+        sumo_folder.prepare_simulation(setup, tmp_path / "sumo")
+        digests.check_unchanged()
 
 
 def test_finished_traffic_has_no_plans(crossing):

@@ -21,7 +21,7 @@ from egvs.formats import osm
 from egvs.formats.georeference import Georeference, WorldFrame
 from egvs.scenario.loading import scenario_from_dict
 from egvs.traffic.network import read_location
-from egvs.world import static_world
+from egvs.world import footprints, static_world, sumo_polygons
 from egvs.world.footprints import FootprintFile
 from egvs.world.geolocation import StatedLocation, network_world_frame
 from egvs.world.map_features import SolidTypes
@@ -323,6 +323,28 @@ def test_warns_about_solid_inside_another(tmp_path: Path) -> None:
     ]
     tower = poly("building", "5,5 15,5 15,15 5,15", height="30")
     assert not read(tmp_path, poly("building", "0,0 20,0 20,20 0,20"), tower).warnings
+
+
+def test_counts_pairs_of_many_solids_in_one_place_up_to_a_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pairs grow with the square of the solids, so a small file would be compared for hours."""
+    monkeypatch.setattr(sumo_polygons, "_MAX_COMPARISONS", 15)
+    tree = '<poi id="t" type="natural.tree" x="2" y="5"/>'
+    (warning,) = read(tmp_path, tree * 5).warnings  # each in four others
+    assert "of the same kind and height: at least 15." in str(warning)
+    monkeypatch.setattr(sumo_polygons, "_MAX_COMPARISONS", 20)
+    (warning,) = read(tmp_path, tree * 5).warnings
+    assert "of the same kind and height: 20." in str(warning)
+
+
+def test_pairs_of_boxes_come_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes = [shapely.box(x, 0, x + 2.5, 1) for x in range(9)]
+    expected = set(zip(*shapely.STRtree(shapes).query(shapes).tolist(), strict=True))
+    monkeypatch.setattr(footprints, "_PAIRS_AT_ONCE", 20)
+    parts = list(footprints.box_pairs(shapes, shapes))
+    assert len(parts) == 5
+    assert {pair for part in parts for pair in zip(*map(np.ndarray.tolist, part), strict=True)} == expected
 
 
 def test_reads_trees_and_poles(tmp_path: Path) -> None:

@@ -283,6 +283,13 @@ def hash_input(path: Path) -> str:
     return files.hash_file(path) if digests is None else digests.of(path)
 
 
+def forget_file(path: Path) -> None:
+    """Forget a file that this program has read and is about to write again; in a run, as :meth:`Digests.forget`."""
+    digests = _IN_USE.get()
+    if digests is not None:
+        digests.forget(path)
+
+
 @contextmanager
 def unchanged_inputs(*paths: Path) -> Iterator[None]:
     """Check, in a run, files that the block reads by their names, as :meth:`Digests.unchanged`."""

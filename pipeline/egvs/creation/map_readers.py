@@ -6,7 +6,8 @@ folder stands for the files in it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from typing import Any
 from egvs.core import readers
 from egvs.core.errors import InputError
 from egvs.core.readers import Reader
+from egvs.core.reading import translate_errors
+from egvs.core.wording import list_first
 
 KIND = "map"
 """Kind of the readers of maps."""
@@ -25,6 +28,8 @@ _FUNCTIONS = {ROADS: "read_roads", SOLIDS: "read_solids", TERRAIN: "read_terrain
 """Function of a reader's module for each part; a module with ``open_roads`` needs no ``read_roads``."""
 
 _EXPECTED = "a module with read_roads or open_roads, read_solids, or read_terrain, see egvs.creation.map_parts"
+
+_MAX_NAMED = 3
 
 MAX_FILES = 1000
 """Largest number of files of a folder."""
@@ -96,6 +101,13 @@ def open_maps(paths: Sequence[Path]) -> MapFiles:
         tuple(file for file in maps if file.has(SOLIDS)),
         tuple(file for file in maps if file.has(TERRAIN)),
     )
+
+
+@contextmanager
+def reading(files: Sequence[MapFile]) -> Iterator[None]:
+    """Translate any exception of the reader of some files to an InputError that names them."""
+    with translate_errors(list_first([str(file.path) for file in files], _MAX_NAMED)):
+        yield
 
 
 def open_surface(paths: Sequence[Path]) -> tuple[MapFile, ...]:

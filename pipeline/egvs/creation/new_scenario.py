@@ -729,10 +729,12 @@ def _terrain_points(terrain: Terrain, window: BaseGeometry, zero_height_m: float
 
 def _read_roads(file: MapFile, options: RoadOptions) -> RoadSource:
     module = file.module
-    if hasattr(module, "open_roads"):
-        roads: RoadSource = module.open_roads(file.path, options)
-        return roads
-    return NetworkRoads.read(module.read_roads(file.path, options), file.path)
+    with map_readers.reading([file]):
+        if hasattr(module, "open_roads"):
+            roads: RoadSource = module.open_roads(file.path, options)
+            return roads
+        road_map = module.read_roads(file.path, options)
+    return NetworkRoads.read(road_map, file.path)
 
 
 def _choose_junction(

@@ -26,7 +26,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
 from egvs.core.wording import by_number, list_first, number_of
-from egvs.creation import building_heights
+from egvs.creation import building_heights, map_readers
 from egvs.creation.carriageway import clear_of_carriageway
 from egvs.creation.junctions import Streets
 from egvs.creation.map_parts import OBJECT_KIND, ImportCounts, MapContext, MappedMesh, MappedSolid, SolidMap, Terrain
@@ -159,7 +159,8 @@ def read_maps(maps: Sequence[MapFile], roads: RoadSource, road_file: MapFile, co
         paths = tuple(file.path for file in group)
         objects = roads.solids(context.window) if paths == (road_file.path,) else None
         if objects is None:
-            objects = group[0].module.read_solids(paths, context)
+            with map_readers.reading(group):
+                objects = group[0].module.read_solids(paths, context)
         read.append(ReadMap(paths, group[0].reader.name, objects))
     return sorted(read, key=lambda read_map: read_map.objects.is_base)
 

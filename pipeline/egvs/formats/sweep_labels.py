@@ -22,6 +22,7 @@ import numpy as np
 from egvs.core import limits, readers
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.reading import translate_errors
 from egvs.core.wording import list_first
 from egvs.formats.sweep_files import Sweep
 
@@ -181,7 +182,8 @@ def read_labels(paths: Sequence[str | Path], options: LabelOptions | None = None
             raise InputError(path, problem, "Convert the labels, or leave the file out.")
         expected = "a module with a function read_labels(path, options)"
         module = cast(LabelFormat, readers.load_reader(reader, ("read_labels",), expected))
-        labels += module.read_labels(path, options or LabelOptions())
+        with translate_errors(path):
+            labels += module.read_labels(path, options or LabelOptions())
     for item in labels:
         _check(item)
     if not labels:

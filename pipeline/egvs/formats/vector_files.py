@@ -20,6 +20,7 @@ from datetime import date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pyarrow as pa
 
 from egvs.core import limits, plugins
@@ -211,7 +212,8 @@ def _feature(row: Mapping[str, Any], geometry_column: str, path: Path) -> dict[s
     shape = None
     if row[geometry_column] is not None:
         try:
-            shape = shapely.from_wkb(row[geometry_column])
+            with np.errstate(invalid="ignore"):  # coordinates that are not finite are reported with the feature
+                shape = shapely.from_wkb(row[geometry_column])
         except shapely.errors.ShapelyError as error:
             raise InputError(path, f"a geometry cannot be read ({error})", "Repair it in a GIS.") from None
     properties = {name: _plain_value(value) for name, value in row.items() if name != geometry_column}

@@ -31,6 +31,7 @@ from egvs.sensors.sites import Pose
 from egvs.stages.inputs import CheckInputs
 from egvs.world import clearances
 from egvs.world.carriageway import Carriageway
+from egvs.world.footprints import box_pairs
 from egvs.world.mesh import World
 from egvs.world.static_world import SolidSource
 
@@ -175,15 +176,13 @@ class _Extents:
 
     def carried(self, solids: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which solids stand on another one, or in it."""
-        import shapely
-
         others = np.flatnonzero(self.is_solid)
-        pairs, below = shapely.STRtree(self.boxes(others)).query(self.boxes(solids), "intersects")
-        first, second = solids[pairs], others[below]
-        foot_m = self.low_m[first, 2]
-        carries = (self.low_m[second, 2] < foot_m - _TOUCH_M) & (self.high_m[second, 2] >= foot_m - _TOUCH_M)
         carried = np.zeros(len(solids), dtype=np.bool_)
-        carried[pairs[carries & (first != second)]] = True
+        for pairs, below in box_pairs(self.boxes(solids), self.boxes(others)):
+            first, second = solids[pairs], others[below]
+            foot_m = self.low_m[first, 2]
+            carries = (self.low_m[second, 2] < foot_m - _TOUCH_M) & (self.high_m[second, 2] >= foot_m - _TOUCH_M)
+            carried[pairs[carries & (first != second)]] = True
         return carried
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from egvs.core import files
+from egvs.core.digests import forget_file
 from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan
 from egvs.core.wording import list_first, number_of, shorten_id
@@ -86,6 +87,7 @@ def apply_plans(scenario: Scenario, path: Path, source: Path) -> None:
             raise InputError(
                 source, f"signal programs cannot be replaced: {error}", "Convert it with netconvert."
             ) from None
+        forget_file(path)
         files.write_text(path, text)
 
 

@@ -12,14 +12,16 @@ world frame; on a flat ground these are the same. Points become discs of ``radiu
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, find_misspelling
+from egvs.core.grid import IntArray
 from egvs.core.polygons import check_corners, check_edge_pairs, repair_polygon
 from egvs.core.reading import read_json
 from egvs.core.wording import number_of
@@ -40,6 +42,9 @@ _QUARTER_SIDES = 4
 
 Z_DATUM, GROUND_DATUM, WORLD_DATUM = "z_datum", "ground", "world"
 """The property that states where heights count from, and its values. A Shapefile cuts names after ten characters."""
+
+# pairs of shapes that are compared at once: bounds the memory
+_PAIRS_AT_ONCE = 1_000_000
 
 # properties that must not be misspelt
 _HEIGHT_KEYS = ("height_m", "base_m", Z_DATUM)
@@ -211,6 +216,30 @@ def _metres(properties: dict[str, Any], key: str, where: str, default: float | N
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_COORDINATE_M:
         raise InputError(f"{where}: {key}", f"expected metres, at most {MAX_COORDINATE_M:g}, got {value!r}")
     return float(value)
+
+
+def box_pairs(
+    shapes: Sequence[BaseGeometry] | NDArray[Any], others: Sequence[BaseGeometry] | NDArray[Any]
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield the pairs of a shape and another one whose boxes meet, in parts, since there may be billions.
+
+    Parameters
+    ----------
+    shapes, others
+        Geometries.
+
+    Yields
+    ------
+    numbers, other_numbers
+        Indices into both, (n,) int64 each.
+    """
+    import shapely
+
+    tree = shapely.STRtree(others)
+    step = max(1, _PAIRS_AT_ONCE // max(1, len(others)))
+    for start in range(0, len(shapes), step):
+        numbers, other_numbers = tree.query(shapes[start : start + step])
+        yield numbers + start, other_numbers
 
 
 def to_polygons(

@@ -30,7 +30,7 @@ from egvs.core.wording import list_first
 from egvs.formats import xml
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference
 from egvs.traffic.network import Location, parse_location
-from egvs.world.footprints import CROSSING_RINGS, Footprint, FootprintFile, to_polygons
+from egvs.world.footprints import CROSSING_RINGS, Footprint, FootprintFile, box_pairs, to_polygons
 from egvs.world.geolocation import StatedLocation, network_world_frame
 from egvs.world.map_features import POLE_TYPES, TRUNK_RADIUS_M, SolidType, SolidTypes, is_underground, vertical_extent
 
@@ -43,6 +43,8 @@ _WHITE = ("white", "255,255,255")
 _NO_TYPE = "(none)"
 # types, and shapes, that a warning names
 _MAX_LISTED = 12
+# pairs of shapes that are compared for a warning: two seconds
+_MAX_COMPARISONS = 50_000
 _HINT = "Make the file with polyconvert and the scenario's network (-n)."
 _LOCATION_HINT = f"{_HINT} If its shapes are in metres of the network, remove <location>."
 
@@ -281,9 +283,10 @@ class _PolygonReader:
             problem = f"none of the {self._polygon_count} polygons is solid"
             hint = "List solid types in [statics.polygon_types], or remove the file from statics.polygons."
             self._warn("polygon types", problem, hint)
-        inside = _count_inside(self._file.footprints)
+        inside, is_complete = _count_inside(self._file.footprints)
         if inside:
-            problem = f"solids inside another of the same kind and height: {inside}. They may be filled courtyards"
+            number = f"{inside}" if is_complete else f"at least {inside}"
+            problem = f"solids inside another of the same kind and height: {number}. They may be filled courtyards"
             self._warn(
                 "filled courtyards", problem, "If so, use polyconvert --osm.merge-relations 1, which cuts them out."
             )
@@ -400,14 +403,36 @@ def _cut_courtyard(footprint: Footprint, courtyard: Polygon) -> Footprint | None
     return replace(footprint, polygon=shapely.orient_polygons(remaining))
 
 
-def _count_inside(footprints: list[Footprint]) -> int:
-    """Count pairs of a footprint inside another of the same kind and vertical extent."""
+def _count_inside(footprints: list[Footprint]) -> tuple[int, bool]:
+    """Count pairs of a footprint inside another of the same kind and vertical extent; stop after many comparisons.
+
+    Returns
+    -------
+    count
+        Pairs.
+    is_complete
+        Whether all pairs were compared.
+    """
     import shapely
 
     shapes = np.array([footprint.polygon for footprint in footprints], dtype=object)
-    pairs = zip(*shapely.STRtree(shapes).query(shapes, predicate="within").tolist(), strict=True)
-    extents = [(footprint.kind, footprint.base_m, footprint.height_m) for footprint in footprints]
-    return sum(inner != outer and extents[inner] == extents[outer] for inner, outer in pairs)
+    if not len(shapes):
+        return 0, True
+    extents: dict[tuple[str, float | None, float], int] = {}
+    names = [(footprint.kind, footprint.base_m, footprint.height_m) for footprint in footprints]
+    extent = np.array([extents.setdefault(name, len(extents)) for name in names])
+    low, high = np.split(shapely.bounds(shapes), 2, axis=1)
+    count = compared = 0
+    for inner, outer in box_pairs(shapes, shapes):
+        is_candidate = (inner != outer) & (extent[inner] == extent[outer])
+        is_candidate &= (low[inner] >= low[outer]).all(axis=1) & (high[inner] <= high[outer]).all(axis=1)
+        inner, outer = inner[is_candidate], outer[is_candidate]
+        left = _MAX_COMPARISONS - compared
+        count += int(np.count_nonzero(shapely.within(shapes[inner[:left]], shapes[outer[:left]])))
+        compared += len(inner)
+        if compared > _MAX_COMPARISONS:
+            return count, False
+    return count, True
 
 
 def _list_types(counts: Counter[str]) -> str:

@@ -19,7 +19,7 @@ from shapely.geometry import box
 
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.creation.map_parts import MapContext, MappedMesh, RoadMap, Terrain
-from egvs.creation.map_readers import MapFile
+from egvs.creation.map_readers import MapFile, reading
 from egvs.creation.road_source import NetworkRoads, RoadSource
 from egvs.creation.terrain import draping, network_heights, relief
 from egvs.creation.terrain.ground_heights import CombinedTerrain, ExtendedTerrain, TinTerrain
@@ -43,12 +43,13 @@ def read_terrain(files: Sequence[MapFile], context: MapContext) -> Terrain | Non
     by_reader: dict[str, list[MapFile]] = {}
     for file in files:
         by_reader.setdefault(file.reader.name, []).append(file)
-    terrains = tuple(
-        group[0].module.read_terrain(tuple(file.path for file in group), context) for group in by_reader.values()
-    )
+    terrains = []
+    for group in by_reader.values():
+        with reading(group):
+            terrains.append(group[0].module.read_terrain(tuple(file.path for file in group), context))
     if not terrains:
         return None
-    return terrains[0] if len(terrains) == 1 else CombinedTerrain(terrains)
+    return terrains[0] if len(terrains) == 1 else CombinedTerrain(tuple(terrains))
 
 
 def measured_ground(mesh: MappedMesh) -> Terrain:

@@ -11,6 +11,7 @@ import numpy as np
 
 from egvs.core import readers
 from egvs.core.errors import InputError
+from egvs.core.reading import translate_errors
 from egvs.extensions.tracks import user_table
 from egvs.extensions.tracks.model import TrackReader, Tracks
 from egvs.scenario.track_columns import TrackColumns
@@ -101,10 +102,11 @@ class TrackSource:
 @lru_cache(maxsize=8)
 def _read_file(path: Path, _modified_ns: tuple[int, ...], columns: str | None) -> Tracks:
     """Read a file, by the JSON of the columns of a user's own table."""
-    if columns is None:
-        tracks = find_reader(path).read(path)
-    else:
-        tracks = user_table.read(path, TrackColumns.model_validate_json(columns))
+    with translate_errors(path):
+        if columns is None:
+            tracks = find_reader(path).read(path)
+        else:
+            tracks = user_table.read(path, TrackColumns.model_validate_json(columns))
     if not (np.isfinite(tracks.time_s) & np.isfinite(tracks.x_m) & np.isfinite(tracks.y_m)).any():
         raise InputError(path, "contains no row with a time and a position", "Use a file with at least one track.")
     return tracks

@@ -115,9 +115,12 @@ class CityJsonFile:
         for geometry in geometries:
             if not isinstance(geometry, dict):
                 raise InputError(f"{where}: geometry", "expected an object", _HINT)
-            if geometry.get("type") == "GeometryInstance":
+            kind = geometry.get("type")
+            if not isinstance(kind, str):
+                raise InputError(f"{where}: geometry", f"expected the name of a type, got {kind!r}"[:120], _HINT)
+            if kind == "GeometryInstance":
                 component.placements.append(self._placement(geometry, where))
-            elif geometry.get("type") in _SURFACES:
+            elif kind in _SURFACES:
                 component.geometries.append(_geometry(geometry, self._vertices, where))
         return component
 
@@ -144,7 +147,7 @@ class CityJsonFile:
             raise InputError(where, "expected an object", _HINT)
         vertices = _points(_typed(document, "vertices-templates", list, where), f"{where}: vertices-templates")
         for number, template in enumerate(_typed(document, "templates", list, where)):
-            if not isinstance(template, dict) or template.get("type") not in _SURFACES:
+            if not isinstance(template, dict) or template.get("type") not in list(_SURFACES):  # it may be a list
                 self.templates[str(number)] = []
                 self._template_lods[str(number)] = 0.0
                 continue
