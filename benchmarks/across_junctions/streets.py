@@ -50,6 +50,11 @@ CANDIDATES = 24
 GROUPS = ("cars", "larger vehicles")
 """Groups of road users (:func:`egvs.scoring.noticed.group_members`) in the order of their numbers in tables."""
 
+SIZES = ("length", "width", "height")
+"""Columns of sizes, in metres."""
+
+_FEATURE_COLUMNS = tuple(f"feature {name}" for name in FEATURES)
+
 
 @dataclass(frozen=True, eq=False)
 class StreetRows:
@@ -71,6 +76,10 @@ class StreetRows:
         Index into :data:`GROUPS` of each vehicle-frame, (n,) int64.
     block
         Block of frames of each vehicle-frame, (n,) int64.
+    size_m
+        Length, width and height of each vehicle-frame, (n, 3) float64.
+    points
+        Points on each in the sweep, (m, n) float64.
     """
 
     junction: str
@@ -81,6 +90,8 @@ class StreetRows:
     ap: Mapping[str, FloatArray]
     group: NDArray[np.int64]
     block: NDArray[np.int64]
+    size_m: FloatArray
+    points: FloatArray
 
 
 def measure(
@@ -127,9 +138,11 @@ def _measure(
         boxes = [frame.boxes[frame.target_rows(held_out.scene.roi)] for frame in frames]
         hits: dict[str, list[FloatArray]] = {name: [] for name in detectors}
         ap: dict[str, list[float]] = {name: [] for name in detectors}
+        points: list[FloatArray] = []
         for by_detector in results.values():
             counted = by_detector[POINT_COUNTS_NAME]
             assert isinstance(counted, PointCounts)
+            points.append(np.concatenate(counted.points).astype(np.float64))
             for name in detectors:
                 found = by_detector[name]
                 assert isinstance(found, DetectedBoxes)
@@ -142,8 +155,9 @@ def _measure(
         "group": np.tile(group, len(candidates)),
         "block": np.tile(frame_blocks(len(frames), BLOCKS)[targets.frame], len(candidates)),
     }
-    rows |= {name: np.concatenate(each) for name, each in hits.items()}
-    rows |= dict(zip(FEATURES, features.reshape(-1, len(FEATURES)).T, strict=True))
+    rows |= {name: np.tile(targets.boxes[:, 3 + axis], len(candidates)) for axis, name in enumerate(SIZES)}
+    rows |= {"points": np.concatenate(points)} | {name: np.concatenate(each) for name, each in hits.items()}
+    rows |= dict(zip(_FEATURE_COLUMNS, features.reshape(-1, len(FEATURES)).T, strict=True))
     write_table(record.with_suffix(f"{record.suffix}.rows.parquet"), rows)
     sites = {"site": [site.name for site in candidates], "sensor": [site.sensor for site in candidates], **ap}
     write_table(record.with_suffix(f"{record.suffix}.sites.parquet"), sites)
@@ -170,7 +184,8 @@ def read_rows(junction: str, record: Path) -> StreetRows:
     names = [name for name in sites if name not in ("site", "sensor")]
     return StreetRows(
         junction, tuple(sites["site"]), tuple(sites["sensor"]),
-        np.stack([column[name] for name in FEATURES], axis=-1).reshape(*shape, len(FEATURES)),
+        np.stack([column[name] for name in _FEATURE_COLUMNS], axis=-1).reshape(*shape, len(FEATURES)),
         {name: column[name].reshape(shape) for name in names}, {name: np.array(sites[name]) for name in names},
         column["group"][: shape[1]], column["block"][: shape[1]],
+        np.column_stack([column[name][: shape[1]] for name in SIZES]), column["points"].reshape(shape),
     )  # fmt: skip
