@@ -14,6 +14,7 @@ from tests.scoring.target_scenes import beams_to, frame, seen
 from tests.scoring.test_visible_targets import AT, car, fan
 
 DATA = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
+CORRECTIONS = json.loads(target_scores.CORRECTIONS_FILE.read_text(encoding="utf-8"))["detectors"]
 HIGH = {"log_points": 8.0, "log_points_on_sides": 8.0, "length_share": 1.0, "width_share": 1.0, "hole_m": 6.0,
         "gap_m": 20.0, "depression_deg": 60.0, "length_m": 18.0, "range_m": 120.0, "side": 1.0,
         "log_spacing": 1.6}  # fmt: skip
@@ -25,24 +26,35 @@ def rows(count: int, seed: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).uniform(list(LOW.values()), list(HIGH.values()), (count, len(FEATURES)))
 
 
-def walked(detector: str, row: np.ndarray) -> float:
+def walked(detector: str, row: np.ndarray, scale: float = 1.0, base: float | None = None, more=()) -> float:
     its = DATA["detectors"][detector]
-    logit = its["base"]
-    for tree in its["trees"]:
+    logit = its["base"] if base is None else base
+    trees = [(scale, tree) for tree in its["trees"]] + [(1.0, tree) for tree in more]
+    for factor, tree in trees:
         node = tree[0]
         while len(node) > 1:
             feature, threshold, left, right = node
             node = tree[left if row[feature] <= threshold else right]
-        logit += node[0]
+        logit += factor * node[0]
     return 1.0 / (1.0 + math.exp(-logit))
 
 
 @pytest.mark.parametrize("detector", MODELLED)
 def test_as_trees_walked_one_by_one(detector):
     x = rows(40)
-    found = target_scores.detectability_model(detector).chances(x)
+    name = detector if detector not in CORRECTIONS else f"{detector}_uncorrected"
+    found = target_scores.detectability_model(name).chances(x)
     np.testing.assert_allclose(found, [walked(detector, row) for row in x], rtol=1e-12)
     assert np.ptp(found) > 0.5 * found.max()  # they tell rows apart
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+def test_correction_scales_the_trees_and_adds_its_own(detector):
+    x, its = rows(40), CORRECTIONS[detector]
+    found = target_scores.detectability_model(detector).chances(x)
+    expected = [walked(detector, row, its["scale"], its["base"], its["trees"]) for row in x]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert not np.allclose(found, target_scores.detectability_model(f"{detector}_uncorrected").chances(x), atol=0.01)
 
 
 @pytest.mark.parametrize("detector", MODELLED)
