@@ -46,7 +46,7 @@ from egvs.scenario.loading import load
 from egvs.scoring.target_scores import CORRECTIONS_FILE
 
 ROOT = Path(__file__).resolve().parents[2]
-LEVELS_TABLE = ROOT / "docs" / "data" / "street_levels.csv"
+RECORDS = ROOT / "docs" / "data" / "larger_study" / "records"
 REPORT_EVERY_S = 30.0
 
 TRAINING_STEPS = 4000
@@ -129,7 +129,10 @@ def _parser() -> argparse.ArgumentParser:
     step.add_argument("--data", type=Path, default=ROOT / "runs" / "levels", help="folder of the streets")
     step.add_argument("--junction", metavar="NAME,NAME", help="measure these only, and write no table")
     step.add_argument("--fit", action="store_true", help="compare corrections, and write the chosen ones")
-    step.add_argument("--out", type=Path, default=LEVELS_TABLE, metavar="FILE", help="for the table, .csv")
+    step.add_argument(
+        "--order", action="store_true", help="order of sites at held-out junctions of the larger study without maps"
+    )
+    step.add_argument("--out", type=Path, default=ROOT / "docs" / "data", metavar="DIR", help="for the tables")
     step.add_argument("--jobs", type=int, help="processes; default: one a core")
     step.set_defaults(step=_levels)
     return parser
@@ -221,6 +224,8 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _levels(arguments: argparse.Namespace) -> int:
+    if arguments.order:
+        return _order(arguments)
     protocol = read_protocol(streets.STREETS_FILE)
     start_s = time.monotonic()
     rows = {}
@@ -242,8 +247,20 @@ def _levels(arguments: argparse.Namespace) -> int:
         files.write_text(CORRECTIONS_FILE, levels.corrections_text(models, fitting))
     table = [*levels.table(others, levels.uncorrected_models(), "uncorrected"),
              *levels.table(others, levels.corrected_models(), "corrected")]  # fmt: skip
-    files.write_text(arguments.out, levels.table_text(table))
+    files.write_text(arguments.out / "street_levels.csv", levels.table_text(table))
     print(levels.summary_text(table))
+    return 0
+
+
+def _order(arguments: argparse.Namespace) -> int:
+    protocol = read_protocol()
+    orders = []
+    for junction in _selected(protocol, arguments.junction, protocol.junctions):
+        if junction.role == "held out" and not junction.files:
+            orders += levels.study_orders(protocol, junction, RECORDS, arguments.data / "study")
+    table = levels.orders_text(orders)
+    files.write_text(arguments.out / "street_levels_order.csv", table)
+    print(table, end="")
     return 0
 
 

@@ -22,8 +22,10 @@ from __future__ import annotations
 
 import json
 import math
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,9 +34,18 @@ from scipy.special import expit
 from scipy.stats import spearmanr
 from sklearn.tree import DecisionTreeRegressor
 
+from benchmarks.across_junctions.candidates import read_candidates, with_sites
+from benchmarks.across_junctions.detections import AP
 from benchmarks.across_junctions.models.fitting import _short, _short_above, equal_weights, fit_trees
-from benchmarks.across_junctions.streets import GROUPS, StreetRows
+from benchmarks.across_junctions.protocol import CANDIDATES_FILE, Junction, Protocol, of_junction
+from benchmarks.across_junctions.records import read_junction
+from benchmarks.across_junctions.streets import GROUPS, StreetRows, visible_from_sites
+from benchmarks.across_junctions.worlds import make_world
 from egvs.core.grid import FloatArray
+from egvs.runs.run import ensure_stages
+from egvs.runs.run_context import open_folder
+from egvs.scenario.loading import load
+from egvs.scenario.score_config import UNCORRECTED_DETECTORS
 from egvs.scoring.target_scores import (
     CORRECTION_FEATURES,
     CORRECTIONS_FILE,
@@ -44,7 +55,9 @@ from egvs.scoring.target_scores import (
     MONOTONICITY,
     DetectabilityModel,
     corrected_entry,
+    expected_detections,
 )
+from egvs.scoring.targets import TargetRecord
 
 POINTS = 100.0
 
@@ -234,9 +247,11 @@ def level_errors(rows: StreetRows, detector: str, expected: FloatArray) -> list[
         difference, block = (expected - hits)[:, members], rows.block[members]
         of_candidates = difference.mean(axis=1)
         upper = np.argsort(-expected[:, members].mean(axis=1), kind="stable")[: math.ceil(len(of_candidates) / 2)]
-        left_out = np.array([difference[:, block != b].mean() for b in np.unique(block)])
-        count = len(left_out)
-        se = float(np.sqrt((count - 1) / count * ((left_out - left_out.mean()) ** 2).sum()))
+        blocks = np.unique(block)
+        se = float("nan")
+        if len(blocks) > 1:
+            left_out = np.array([difference[:, block != b].mean() for b in blocks])
+            se = float(np.sqrt((len(blocks) - 1) * np.mean((left_out - left_out.mean()) ** 2)))
         rho = float("nan")
         if name == "all":
             rho = float(spearmanr(expected.mean(axis=1), rows.ap[detector], nan_policy="omit").statistic)
@@ -285,6 +300,60 @@ def compare(fitting: Sequence[StreetRows], detectors: Sequence[str] = DETECTORS)
     return results
 
 
+# ---- order of sites at held-out junctions of the larger study
+
+
+@dataclass(frozen=True)
+class StudyOrder:
+    """Spearman's coefficient of the score with the AP that the larger study recorded, at one of its junctions.
+
+    Attributes
+    ----------
+    losses
+        Whether the score has losses of returns. The recorded sweeps have none.
+    rho
+        By the name of the models.
+    """
+
+    junction: str
+    detector: str
+    losses: bool
+    rho: Mapping[str, float]
+
+
+def study_orders(protocol: Protocol, junction: Junction, records: Path, worlds: Path) -> list[StudyOrder]:
+    """Compute the score of the candidates of a junction again, and compare it with the recorded AP of each detector."""
+    world = make_world(protocol, junction, None, worlds)
+    record = read_junction(records, junction.name)
+    orders = []
+    for losses in (False, True):
+        with tempfile.TemporaryDirectory(prefix=".work-", dir=worlds) as temporary:
+            sites = list(of_junction(read_candidates(), junction, CANDIDATES_FILE))
+            overrides = [] if losses else ["effects.range_limit=false"]
+            scenario = with_sites(load(world, overrides), sites, Path(temporary) / "sites.csv")
+            context = open_folder(scenario, Path(temporary) / "scored", jobs=1)
+            ensure_stages(context, "statics", "traffic")
+            targets = TargetRecord.read(context.path("trajectories.parquet"), scenario.roi.grid)
+            scores: dict[str, list[float]] = {"corrected": [], "uncorrected": []}
+            for seen in visible_from_sites(context.scene, targets):
+                scores["corrected"].append(expected_detections(seen, DETECTORS))
+                scores["uncorrected"].append(expected_detections(seen, UNCORRECTED_DETECTORS))
+        for detector, measures in record.detections.items():
+            ap = measures[AP].values
+            rho = {name: float(spearmanr(values, ap, nan_policy="omit").statistic) for name, values in scores.items()}
+            orders.append(StudyOrder(junction.name, detector, losses, rho))
+    return orders
+
+
+def orders_text(orders: Sequence[StudyOrder]) -> str:
+    """Return the table as CSV."""
+    lines = ["junction,detector,losses,uncorrected,corrected"]
+    for order in orders:
+        rho = f"{order.rho['uncorrected']:.4f},{order.rho['corrected']:.4f}"
+        lines.append(f"{order.junction},{order.detector},{'yes' if order.losses else 'no'},{rho}")
+    return "\n".join(lines) + "\n"
+
+
 # ---- tables
 
 
@@ -294,12 +363,12 @@ def table(each: Sequence[StreetRows], models: Mapping[str, Model], label: str) -
     A detector without a model is compared with the mean of the models, which is what a run prints.
     """
     rows = []
-    for of_junction in each:
-        by_model = {name: chances(model, of_junction) for name, model in models.items()}
+    for at in each:
+        by_model = {name: chances(model, at) for name, model in models.items()}
         mean: FloatArray = np.mean(list(by_model.values()), axis=0)
-        for detector in of_junction.hits:
+        for detector in at.hits:
             expected: FloatArray = by_model.get(detector, mean)
-            rows += [(label, level) for level in level_errors(of_junction, detector, expected)]
+            rows += [(label, level) for level in level_errors(at, detector, expected)]
     return rows
 
 

@@ -14,7 +14,7 @@ frames, *found* the share found of the same; so the error contains no difference
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,13 +34,14 @@ from egvs.extensions.validation.detection_metrics import BLOCKS, frame_blocks
 from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME, DetectedBoxes, PointCounts
 from egvs.extensions.validation.detector_runs import SiteDetectionTask, run_detectors
 from egvs.extensions.validation.detectors import base
-from egvs.extensions.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
+from egvs.extensions.validation.held_out_traffic import prepare_held_out_traffic
 from egvs.scenario.loading import load
 from egvs.scoring.noticed import group_members
 from egvs.scoring.target_scores import FEATURES, detectability_features
-from egvs.scoring.targets import TargetRecord, visible_targets
+from egvs.scoring.targets import TargetRecord, VisibleTargets, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
+from egvs.sensors.scene import Scene
 
 STREETS_FILE = FOLDER / "streets.toml"
 
@@ -132,7 +133,7 @@ def _measure(
         )
         frames = list(held_out.read())
         targets = TargetRecord.of(frames, held_out.scenario.roi.grid)
-        features = np.stack(_features(held_out, targets))
+        features = np.stack([detectability_features(seen) for seen in visible_from_sites(held_out.scene, targets)])
         results = run_detectors(held_out.scene.sites, SiteDetectionTask(held_out, detectors), jobs=jobs,
                                 progress=progress)  # fmt: skip
         boxes = [frame.boxes[frame.target_rows(held_out.scene.roi)] for frame in frames]
@@ -163,16 +164,12 @@ def _measure(
     write_table(record.with_suffix(f"{record.suffix}.sites.parquet"), sites)
 
 
-def _features(held_out: HeldOutTraffic, targets: TargetRecord) -> list[FloatArray]:
-    """Return the features of all vehicle-frames from each candidate, (n, f) float64 each."""
-    scene = held_out.scene
+def visible_from_sites(scene: Scene, targets: TargetRecord) -> Iterator[VisibleTargets]:
+    """Yield what each site of a scene sees of the vehicle-frames of a record."""
     scanner = Scanner(scene)
-    features = []
     for site in scene.sites:
         beams = Beams.of(scanner.scan_site(site))
-        visible = visible_targets(targets, beams, ReturnProbability.of(scene, beams.sensor))
-        features.append(detectability_features(visible))
-    return features
+        yield visible_targets(targets, beams, ReturnProbability.of(scene, beams.sensor))
 
 
 def read_rows(junction: str, record: Path) -> StreetRows:

@@ -33,10 +33,10 @@ standard error contains how far they disagree (:mod:`egvs.scoring.standard_error
 The parameters of the model are in ``target_scores.json`` beside this module. They were trained on the detections of
 each detector at junctions that no result is quoted for (``benchmarks/across_junctions`` fits them again;
 docs/validity.md shows their accuracy elsewhere). Those junctions had few sizes of vehicles and no losses of returns, so
-the models are *corrected for streets*: the logit is scaled and shifted, and further trees are added, which
-also know the size of vehicles that are not cars (``street_corrections.json``; ``python -m benchmarks.across_junctions levels``). The models without correction have
-names of their own, such as ``cluster_uncorrected``. A detection is a box that overlaps the vehicle by more than 0.7, in
-the mean of the overlaps from above and in 3D.
+the models are *corrected for streets*: the logit is scaled and shifted, and further trees are added, which also know
+the size of vehicles that are not cars (``street_corrections.json``, made by ``python -m benchmarks.across_junctions
+levels``). The models without correction have names of their own, such as ``cluster_uncorrected``. A detection
+is a box that overlaps the vehicle by more than 0.7, in the mean of the overlaps from above and in 3D.
 
 *Noticed*: the share of vehicles that people notice in the sweeps, from curves over points that were measured with
 labelled sweeps (:mod:`egvs.scoring.noticed`).
