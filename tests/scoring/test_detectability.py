@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from egvs.scoring import target_scores
-from egvs.scoring.target_scores import DETECTORS, FEATURES, MODELLED, MONOTONICITY, DetectabilityModel
+from egvs.scoring.target_scores import (
+    CORRECTION_FEATURES,
+    DETECTORS,
+    FEATURES,
+    MODELLED,
+    MONOTONICITY,
+    DetectabilityModel,
+)
 from tests.scoring.target_scenes import beams_to, frame, seen
 from tests.scoring.test_visible_targets import AT, car, fan
 
@@ -17,13 +24,13 @@ DATA = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
 CORRECTIONS = json.loads(target_scores.CORRECTIONS_FILE.read_text(encoding="utf-8"))["detectors"]
 HIGH = {"log_points": 8.0, "log_points_on_sides": 8.0, "length_share": 1.0, "width_share": 1.0, "hole_m": 6.0,
         "gap_m": 20.0, "depression_deg": 60.0, "length_m": 18.0, "range_m": 120.0, "side": 1.0,
-        "log_spacing": 1.6}  # fmt: skip
+        "log_spacing": 1.6, "larger_length_m": 18.0, "larger_width_m": 2.6, "larger_height_m": 4.0}  # fmt: skip
 LOW = dict.fromkeys(HIGH, 0.0) | {"log_spacing": -4.0}
 
 
 def rows(count: int, seed: int = 1) -> np.ndarray:
-    """Features anywhere in their ranges, (count, f)."""
-    return np.random.default_rng(seed).uniform(list(LOW.values()), list(HIGH.values()), (count, len(FEATURES)))
+    """Features of corrected models anywhere in their ranges, (count, g)."""
+    return np.random.default_rng(seed).uniform(list(LOW.values()), list(HIGH.values()), (count, len(HIGH)))
 
 
 def walked(detector: str, row: np.ndarray, scale: float = 1.0, base: float | None = None, more=()) -> float:
@@ -86,6 +93,11 @@ def test_a_node_comes_before_those_that_it_leads_to(detector):
         assert all(min(node[2:]) > number for number, node in enumerate(tree) if len(node) > 1)
 
 
+def test_features_that_a_tree_needs_must_be_there():
+    with pytest.raises(ValueError, match="expected 14 features, got 11"):
+        DetectabilityModel.of({"base": 0.0, "trees": [[[13, 2.0, 1, 2], [-1.0], [1.0]]]}).chances(rows(3)[:, :11])
+
+
 def test_a_tree_by_hand():
     model = DetectabilityModel.of({"base": 0.5, "trees": [[[0, 2.0, 1, 2], [-1.5], [1.0]], [[0.25]]]})
     x = np.zeros((3, len(FEATURES)))
@@ -125,7 +137,8 @@ def test_a_detector_that_measures_heights_from_the_sensor_misses_from_high_mount
         row = dict(LOW, log_points=6.0, log_points_on_sides=5.5, length_share=0.98, width_share=0.9, gap_m=20.0,
                    depression_deg=math.degrees(depression_rad), length_m=4.5, range_m=15.0 / math.cos(depression_rad),
                    side=0.7, log_spacing=-2.2)  # fmt: skip
-        return target_scores.detectability_model(detector).chances(np.array([[row[name] for name in FEATURES]]))[0]
+        features = np.array([[row[name] for name in CORRECTION_FEATURES]])
+        return target_scores.detectability_model(detector).chances(features)[0]
 
     assert chance("pointpillars_sensor", 2.0) > 0.5
     assert chance("pointpillars_sensor", 6.0) < 0.2 * chance("pointpillars_sensor", 2.0)

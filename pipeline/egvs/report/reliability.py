@@ -26,8 +26,8 @@ _SEEDS_NOTE_OF_DETECTORS = (
 )
 _SIZE_NOTE = (
     "The order of sites by this score was validated better than its size: on simulated streets, the shares found "
-    "differed from the expected ones by {:g} percentage points (root mean square), which the ± of the answer contains; "
-    "for a detector without a model, by {:g} (docs/validity.md)."
+    "differed from the expected ones by {:g} percentage points (root mean square), which the error in the answer "
+    "contains, and for a detector without a model by {:g} (docs/validity.md)."
 )
 _NOTICED_NOTE = (
     "Found: a box overlaps the vehicle by more than 0.7 (IoU); noticed: people label it within 3 m, by curves from one "
@@ -92,7 +92,9 @@ def describe_reliability(
 def _size_note(detectors: Sequence[str]) -> str:
     """Return how far the size of the score was validated."""
     levels = STUDY.street_levels
-    return _SIZE_NOTE.format(max(levels.error_points[name] for name in detectors), levels.other_detector_error_points)
+    measured = [levels.error_points[name] for name in detectors if name in levels.error_points]
+    points = max(measured or levels.error_points.values())
+    return _SIZE_NOTE.format(points, levels.other_detector_error_points)
 
 
 def _error_note(seeds: int, traffic: str, detectors: Sequence[str]) -> str:
