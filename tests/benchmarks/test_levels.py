@@ -15,6 +15,7 @@ from benchmarks.across_junctions.protocol import read_protocol
 from benchmarks.across_junctions.streets import StreetRows
 
 from egvs.results.study_results import STUDY
+from egvs.scenario.score_config import UNCORRECTED
 from egvs.scoring import target_scores
 from egvs.scoring.target_scores import CORRECTION_FEATURES, DETECTORS, FEATURES, DetectabilityModel
 from tests.scoring.target_scenes import frame, seen
@@ -121,10 +122,10 @@ def test_fleets_have_the_sizes_of_the_labelled_street_and_none_in_common() -> No
                 if size is not None:
                     assert (np.mean(values), np.std(values)) == pytest.approx(size, abs=0.01)
         assert max(kind.width_m for kind in fleet) <= 2.55 and max(kind.height_m for kind in fleet) <= 4.0
-    sizes = [
+    boxes = [
         {(k.length_m, k.width_m, k.height_m) for k in fleet if k.name != "motorcycle"} for fleet in fleets.values()
     ]
-    assert not sizes[0] & sizes[1]
+    assert not boxes[0] & boxes[1]
 
 
 # ---- tables of the docs
@@ -138,7 +139,7 @@ def _street_levels(model: str, detector: str, road_users: str = "all") -> Iterat
 
 
 def test_the_printed_error_is_the_measured_one() -> None:
-    names = {"corrected": "", "uncorrected": target_scores.UNCORRECTED}
+    names = {"corrected": "", "uncorrected": UNCORRECTED}
     for model, ending in names.items():
         for detector in DETECTORS:
             rms = math.sqrt(np.mean([float(row["upper_rms"]) ** 2 for row in _street_levels(model, detector)]))
