@@ -6,6 +6,7 @@
     measure   measure what is missing, part by part; an interrupted study continues where it stopped
     fit       compare models of the score on the training junctions, or fit them
     tables    write the tables from the records
+    levels    measure the level of the score on simulated streets, or fit its corrections there
 
 Junctions whose maps are not in the folder of ``--maps`` are left out, and named.
 """
@@ -18,7 +19,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.across_junctions import build, candidates, costs, study_detectors, tables, training
+from benchmarks.across_junctions import build, candidates, costs, levels, streets, study_detectors, tables, training
 from benchmarks.across_junctions.measurement import Extent, PartPlan, measure
 from benchmarks.across_junctions.models import figures
 from benchmarks.across_junctions.protocol import (
@@ -42,8 +43,10 @@ from egvs.core.errors import EgvsError, InputError, MissingBackendError
 from egvs.core.progress import ProgressCallback
 from egvs.extensions.validation.detectors import base
 from egvs.scenario.loading import load
+from egvs.scoring.target_scores import CORRECTIONS_FILE
 
 ROOT = Path(__file__).resolve().parents[2]
+RECORDS = ROOT / "docs" / "data" / "larger_study" / "records"
 REPORT_EVERY_S = 30.0
 
 TRAINING_STEPS = 4000
@@ -75,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
     data.add_argument("--data", type=Path, default=ROOT / "runs" / "across_junctions", help="folder of the study")
     common.add_argument("--maps", type=Path, metavar="DIR", help="folder of the maps that are not shipped")
     common.add_argument("--junction", metavar="NAME,NAME", help="default: all (build), or all with candidates")
-    steps = parser.add_subparsers(required=True, metavar="build|list|detector|measure|fit|tables")
+    steps = parser.add_subparsers(required=True, metavar="build|list|detector|measure|fit|tables|levels")
 
     step = steps.add_parser("build", parents=[data, common], help="make the scenarios")
     step.add_argument(
@@ -121,6 +124,17 @@ def _parser() -> argparse.ArgumentParser:
     step = steps.add_parser("tables", parents=[data], help="write the tables")
     step.add_argument("--out", type=Path, metavar="DIR", help="for the tables; default: below the folder of the study")
     step.set_defaults(step=_tables)
+
+    step = steps.add_parser("levels", help="level of the score on simulated streets, without and with corrections")
+    step.add_argument("--data", type=Path, default=ROOT / "runs" / "levels", help="folder of the streets")
+    step.add_argument("--junction", metavar="NAME,NAME", help="measure these only, and write no table")
+    step.add_argument("--fit", action="store_true", help="compare corrections, and write the chosen ones")
+    step.add_argument(
+        "--order", action="store_true", help="order of sites at held-out junctions of the larger study without maps"
+    )
+    step.add_argument("--out", type=Path, default=ROOT / "docs" / "data", metavar="DIR", help="for the tables")
+    step.add_argument("--jobs", type=int, help="processes; default: one a core")
+    step.set_defaults(step=_levels)
     return parser
 
 
@@ -206,6 +220,47 @@ def _list(arguments: argparse.Namespace) -> int:
     for name, digest in digests.digests.items():
         print(f"{digest}  {name}")
     print(f"SHA-256 of the protocol: {digests.digest}")
+    return 0
+
+
+def _levels(arguments: argparse.Namespace) -> int:
+    if arguments.order:
+        return _order(arguments)
+    protocol = read_protocol(streets.STREETS_FILE)
+    start_s = time.monotonic()
+    rows = {}
+    for junction in _selected(protocol, arguments.junction, protocol.junctions):
+        progress = _progress(junction.name, start_s)
+        rows[junction.name] = streets.measure(
+            protocol, junction, arguments.data, jobs=arguments.jobs, progress=progress
+        )
+        print(f"{time.monotonic() - start_s:6.0f} s  {junction.name}", flush=True)
+    if arguments.junction is not None:
+        return 0
+    fitting, others = (
+        [rows[junction.name] for junction in protocol.junctions if junction.role == role]
+        for role in ("training", "held out")
+    )
+    if arguments.fit:
+        print(levels.comparison_text(levels.compare(fitting)))
+        models = levels.models_by(levels.CHOSEN, fitting)
+        files.write_text(CORRECTIONS_FILE, levels.corrections_text(models, fitting))
+    table = [*levels.table(others, levels.uncorrected_models(), "uncorrected"),
+             *levels.table(others, levels.corrected_models(), "corrected")]  # fmt: skip
+    files.write_text(arguments.out / "street_levels.csv", levels.table_text(table))
+    print(levels.summary_text(table))
+    return 0
+
+
+def _order(arguments: argparse.Namespace) -> int:
+    protocol = read_protocol()
+    orders = []
+    for junction in _selected(protocol, arguments.junction, protocol.junctions):
+        if junction.role == "held out" and not junction.files:
+            orders += levels.study_orders(protocol, junction, RECORDS, arguments.data / "study")
+    table = levels.orders_text(orders)
+    files.write_text(arguments.out / "street_levels_order.csv", table)
+    print(table, end="")
     return 0
 
 

@@ -70,7 +70,7 @@ def build(protocol: Protocol, junction: Junction, maps: Path | None, folder: Pat
         scenario_folder = make_world(protocol, junction, maps, folder)
         digest = world_digest(scenario_folder)
         scenario = load(scenario_folder)
-        candidates = _candidates(protocol, junction, scenario, folder)
+        candidates = candidates_of(protocol, junction, scenario, folder)
         vehicles, different, dense = _traffic(scenario, folder)
     except EgvsError as error:
         return BuiltJunction(junction, problem=str(error))
@@ -78,7 +78,8 @@ def build(protocol: Protocol, junction: Junction, maps: Path | None, folder: Pat
     return BuiltJunction(junction, digest, candidates, vehicles, different, dense, problem)
 
 
-def _candidates(protocol: Protocol, junction: Junction, scenario: Scenario, folder: Path) -> dict[Site, float]:
+def candidates_of(protocol: Protocol, junction: Junction, scenario: Scenario, folder: Path) -> dict[Site, float]:
+    """Draw the candidates of a junction whose scenario was made, with their heights above the ground in metres."""
     with tempfile.TemporaryDirectory(prefix=".work-", dir=_existing(folder)) as temporary:
         work = open_folder(scenario, Path(temporary))
         ensure_stages(work, "statics")

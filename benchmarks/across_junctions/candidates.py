@@ -186,5 +186,5 @@ def with_sites(scenario: Scenario, sites: Sequence[Site], file: Path) -> Scenari
         rows.writerow(["site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor"])
         for site in sites:
             rows.writerow([site.name, *map(repr, (*site.pose.position_m, *site.pose.angles_deg)), site.sensor])
-    model = SitesConfig(file=str(file.resolve()), sensor=scenario.sites.sensor)
+    model = SitesConfig(file=str(file.resolve()), sensor=sites[0].sensor)  # rows have their own; one repeats it
     return scenario.model_copy(update={"sites": model})

@@ -32,7 +32,7 @@ from egvs.scenario.fields import StrictModel, find_duplicates
 from egvs.scenario.loading import format_validation_error
 from egvs.scenario.traffic_config import VehicleKind
 from egvs.scoring import target_scores
-from egvs.scoring.target_scores import MODEL_FILE
+from egvs.scoring.target_scores import CORRECTIONS_FILE, MODEL_FILE
 from egvs.sensors.sensor import CATALOGUE, catalogue_digest
 
 FOLDER = Path(__file__).resolve().parent
@@ -363,7 +363,8 @@ class ProtocolFiles:
 def frozen_digests() -> dict[str, str]:
     """Return the hash of each model of the score, of each detector, and of each module of :data:`JUDGING`, by name."""
     protocol = read_protocol()
-    digests = {"score": files.hash_file(MODEL_FILE), "features": stage_keys.text_digest(target_scores.__name__)}
+    score = files.hash_json([files.hash_file(MODEL_FILE), files.hash_file(CORRECTIONS_FILE)])
+    digests = {"score": score, "features": stage_keys.text_digest(target_scores.__name__)}
     for name in protocol.detectors.held_out:
         detector = base.make_detector(name)
         source = stage_keys.source_digest(type(detector).__module__).digest

@@ -12,7 +12,7 @@ from benchmarks.across_junctions.models.comparison import SiteRows, models_for
 from benchmarks.across_junctions.records import VEHICLES, JunctionRecord, read_table
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.scoring.target_scores import FEATURES, detectability_model
+from egvs.scoring.target_scores import FEATURES, uncorrected_model
 
 
 def read_rows(folder: Path, record: JunctionRecord, detector: str) -> list[SiteRows]:
@@ -53,7 +53,7 @@ def read_rows(folder: Path, record: JunctionRecord, detector: str) -> list[SiteR
 
 
 def _shipped(detector: str, columns: dict[str, FloatArray]) -> FloatArray:
-    """Return the probability of each vehicle-frame by the shipped models; 0 without a point."""
+    """Return the probability of each vehicle-frame by the models without correction for streets; 0 without a point."""
     features = np.column_stack([columns[name] for name in FEATURES])
-    chances = np.mean([detectability_model(name).chances(features) for name in models_for([detector])], axis=0)
+    chances = np.mean([uncorrected_model(name).chances(features) for name in models_for([detector])], axis=0)
     return np.where(columns["log_points"] > 0.0, chances, 0.0)

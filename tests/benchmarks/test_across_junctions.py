@@ -63,7 +63,7 @@ from egvs.extensions.validation.detectors.pointpillars import SHIPPED_MODEL, Onn
 from egvs.extensions.validation.held_out_traffic import prepare_held_out_traffic
 from egvs.runs import stage_keys
 from egvs.scenario.loading import load
-from egvs.scoring.target_scores import DETECTORS, FEATURES, MODELLED, DetectabilityModel, detectability_model
+from egvs.scoring.target_scores import DETECTORS, FEATURES, MODELLED, DetectabilityModel, uncorrected_model
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site
 from egvs.stages.inputs import build_scene
@@ -647,7 +647,7 @@ def test_reliability_of_made_up_vehicles(tmp_path: Path, monkeypatch: pytest.Mon
     hits = np.concatenate([site.hits for site in sites])[seen]
     columns = sites[3].features.columns
     features = np.column_stack([columns[name] for name in FEATURES])
-    each = [detectability_model(name).chances(features) for name in DETECTORS]
+    each = [uncorrected_model(name).chances(features) for name in DETECTORS]
     np.testing.assert_allclose(sites[3].shipped, np.where(columns["log_points"] > 0.0, np.mean(each, axis=0), 0.0))
     for _, _, chance, found, count in [row for row in table.rows if row[1] == "range_image"]:
         members = np.floor(np.minimum(chances, 0.999) * 10) == np.floor(min(chance, 0.999) * 10)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +14,17 @@ from egvs.drawing.run_figures import site_caption
 from egvs.report import ranking_text, sensor_text
 from egvs.report.sections import describe_poles_on_road
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.levels import GroupLevel, NoticedShare, detection_range
+from egvs.results.levels import (
+    MAX_LEVEL_ERROR,
+    GroupLevel,
+    NoticedShare,
+    detection_range,
+    found_text,
+    level_error,
+)
 from egvs.results.ranking import Pole, RankedSite, Ranking, ScoreValue
 from egvs.results.sensors import SensorComparison
+from egvs.results.study_results import STUDY
 from egvs.scenario.loading import load
 from egvs.scenario.score_config import CostsConfig
 
@@ -75,28 +85,39 @@ def with_noticed(*rows: tuple[str, float, float], low: float = 0.0, high: float 
 BOTH = ("cluster", "pointpillars")
 
 
-def test_the_headline_names_whose_level_it_is() -> None:
+def test_the_headline_names_whose_level_it_is_with_the_measured_error() -> None:
+    error = level_error(BOTH, 0.01)
+    assert STUDY.street_levels.error_points["cluster"] < 100.0 * error < MAX_LEVEL_ERROR * 100.0
+    found = f"should find 84 ± {math.ceil(100.0 * error)} % of vehicles"
     ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
     assert ranking_text.headline(ranked, has_traffic=True, detectors=BOTH) == (
-        "a is the best of 2 sites: detectors (cluster, pointpillars) should find 84.1 % of vehicles; people would "
-        "notice 90 ± 2 % in its sweeps"
-    )
-    assert ranking_text.headline(with_noticed(("a", 0.841, 0.897)), has_traffic=True, detectors=("cluster",)) == (
-        "a, the only site: the detector cluster should find 84.1 % of vehicles; people would notice 90 ± 2 % in its "
+        f"a is the best of 2 sites: detectors (cluster, pointpillars) {found}; people would notice 90 ± 2 % in its "
         "sweeps"
+    )
+    of_one = f"should find 84 ± {math.ceil(100.0 * level_error(['cluster'], 0.01))} % of vehicles"
+    assert ranking_text.headline(with_noticed(("a", 0.841, 0.897)), has_traffic=True, detectors=("cluster",)) == (
+        f"a, the only site: the detector cluster {of_one}; people would notice 90 ± 2 % in its sweeps"
     )
     tie = with_noticed(("a", 0.841, 0.897), ("b", 0.841, 0.897))
     assert ranking_text.headline(replace(tie, best=tie.sites), has_traffic=True, detectors=BOTH).startswith(
-        "All 2 sites score the same: detectors (cluster, pointpillars) should find 84.1 % of vehicles; "
+        f"All 2 sites score the same: detectors (cluster, pointpillars) {found}; "
     )
     both_first = with_noticed(("a", 0.841, 0.897), ("b", 0.841, 0.897), ("c", 0.5, 0.6))
     assert ranking_text.headline(replace(both_first, best=both_first.sites[:2]), True, BOTH).startswith(
-        "a and b share first place among 3 sites; from a, detectors (cluster, pointpillars) should find 84.1 %"
+        f"a and b share first place among 3 sites; from a, detectors (cluster, pointpillars) {found}"
     )
-    without = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8))  # a run of an earlier version
+    without = by_vehicles(("a", 50.0, 0.841), ("b", 90.0, 0.8))  # a run of an earlier version
     assert ranking_text.headline(without, has_traffic=True, detectors=BOTH) == (
-        "a is the best of 2 sites: detectors (cluster, pointpillars) should find 87.1 % of vehicles"
+        f"a is the best of 2 sites: detectors (cluster, pointpillars) {found}"
     )
+
+
+def test_a_level_with_a_large_or_unknown_error_is_a_range() -> None:
+    """At most ± 10 is printed: beyond that, and for a model whose level was not measured, a range."""
+    assert found_text(0.5, BOTH, 0.2) == "25 to 75 %"
+    assert found_text(0.5, ["pointpillars_sensor"], 0.01) == "40 to 60 %"
+    assert found_text(0.97, ["pointpillars_sensor"], None) == "85 to 100 %"
+    assert re.fullmatch(r"50 ± \d+ %", found_text(0.5, BOTH, None))
 
 
 def test_a_level_that_nothing_supports_is_a_range() -> None:
@@ -112,7 +133,7 @@ def test_a_level_that_nothing_supports_is_a_range() -> None:
     assert NoticedShare(0.5, None, 0.5, 0.5).text == "50 %"
 
 
-def test_what_detectors_find_is_a_range_where_many_vehicles_are_not_cars() -> None:
+def test_what_detectors_find_is_a_range_where_many_vehicles_are_of_no_measured_group() -> None:
     """0.75 x 0.9 of all are cars that are found; of the other 25 %, none or all. The order of sites stays."""
     noticed = NoticedShare(0.9, 0.02, 0.9, 0.9)
     cars = GroupLevel("cars", 300, 0.75, 0.9, 0.01, noticed)
@@ -120,16 +141,17 @@ def test_what_detectors_find_is_a_range_where_many_vehicles_are_not_cars() -> No
         GroupLevel("larger vehicles", 80, 0.2, 0.4, 0.02, noticed),
         GroupLevel("people", 20, 0.05, 0.5, 0.02, noticed),
     )
-    found = detection_range([cars, larger, people])
-    assert (found.low, found.high, found.untrained) == pytest.approx((0.675, 0.925, 0.25))
+    assert detection_range([cars, larger, people], BOTH) is None  # 5 % are people
+    found = detection_range([cars, larger, people], ["cluster_uncorrected"])
+    assert (found.low, found.high, found.outside) == pytest.approx((0.675, 0.925, 0.25))
     ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
     assert ranking_text.headline(ranked, has_traffic=True, detectors=BOTH, found=found) == (
-        "a is the best of 2 sites: detectors (cluster, pointpillars) should find 65 to 95 % of vehicles (models know "
-        "nothing of the 25 % that are not cars); people would notice 90 ± 2 % in its sweeps"
+        "a is the best of 2 sites: detectors (cluster, pointpillars) should find 65 to 95 % of vehicles (nothing is "
+        "known of the 25 % that are not cars); people would notice 90 ± 2 % in its sweeps"
     )
-    assert detection_range([replace(larger, weight_share=1.0)]).text == "0 to 100 %"
-    few = [replace(cars, weight_share=0.9), replace(larger, weight_share=0.1)]
-    assert detection_range(few) is None and detection_range(()) is None
+    assert detection_range([replace(people, weight_share=1.0)], BOTH).text == "0 to 100 %"
+    few = [replace(cars, weight_share=0.9), replace(people, weight_share=0.1)]
+    assert detection_range(few, BOTH) is None and detection_range((), BOTH) is None
 
 
 def test_a_pole_from_which_people_notice_clearly_more_is_named() -> None:

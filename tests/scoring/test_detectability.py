@@ -9,40 +9,59 @@ import numpy as np
 import pytest
 
 from egvs.scoring import target_scores
-from egvs.scoring.target_scores import DETECTORS, FEATURES, MODELLED, MONOTONICITY, DetectabilityModel
+from egvs.scoring.target_scores import (
+    CORRECTION_FEATURES,
+    DETECTORS,
+    FEATURES,
+    MODELLED,
+    MONOTONICITY,
+    DetectabilityModel,
+)
 from tests.scoring.target_scenes import beams_to, frame, seen
 from tests.scoring.test_visible_targets import AT, car, fan
 
 DATA = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
+CORRECTIONS = json.loads(target_scores.CORRECTIONS_FILE.read_text(encoding="utf-8"))["detectors"]
 HIGH = {"log_points": 8.0, "log_points_on_sides": 8.0, "length_share": 1.0, "width_share": 1.0, "hole_m": 6.0,
         "gap_m": 20.0, "depression_deg": 60.0, "length_m": 18.0, "range_m": 120.0, "side": 1.0,
-        "log_spacing": 1.6}  # fmt: skip
+        "log_spacing": 1.6, "larger_length_m": 18.0, "larger_width_m": 2.6, "larger_height_m": 4.0}  # fmt: skip
 LOW = dict.fromkeys(HIGH, 0.0) | {"log_spacing": -4.0}
 
 
 def rows(count: int, seed: int = 1) -> np.ndarray:
-    """Features anywhere in their ranges, (count, f)."""
-    return np.random.default_rng(seed).uniform(list(LOW.values()), list(HIGH.values()), (count, len(FEATURES)))
+    """Features of corrected models anywhere in their ranges, (count, g)."""
+    return np.random.default_rng(seed).uniform(list(LOW.values()), list(HIGH.values()), (count, len(HIGH)))
 
 
-def walked(detector: str, row: np.ndarray) -> float:
+def walked(detector: str, row: np.ndarray, scale: float = 1.0, base: float | None = None, more=()) -> float:
     its = DATA["detectors"][detector]
-    logit = its["base"]
-    for tree in its["trees"]:
+    logit = its["base"] if base is None else base
+    trees = [(scale, tree) for tree in its["trees"]] + [(1.0, tree) for tree in more]
+    for factor, tree in trees:
         node = tree[0]
         while len(node) > 1:
             feature, threshold, left, right = node
             node = tree[left if row[feature] <= threshold else right]
-        logit += node[0]
+        logit += factor * node[0]
     return 1.0 / (1.0 + math.exp(-logit))
 
 
 @pytest.mark.parametrize("detector", MODELLED)
 def test_as_trees_walked_one_by_one(detector):
     x = rows(40)
-    found = target_scores.detectability_model(detector).chances(x)
+    name = detector if detector not in CORRECTIONS else f"{detector}_uncorrected"
+    found = target_scores.detectability_model(name).chances(x)
     np.testing.assert_allclose(found, [walked(detector, row) for row in x], rtol=1e-12)
     assert np.ptp(found) > 0.5 * found.max()  # they tell rows apart
+
+
+@pytest.mark.parametrize("detector", DETECTORS)
+def test_correction_scales_the_trees_and_adds_its_own(detector):
+    x, its = rows(40), CORRECTIONS[detector]
+    found = target_scores.detectability_model(detector).chances(x)
+    expected = [walked(detector, row, its["scale"], its["base"], its["trees"]) for row in x]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert not np.allclose(found, target_scores.detectability_model(f"{detector}_uncorrected").chances(x), atol=0.01)
 
 
 @pytest.mark.parametrize("detector", MODELLED)
@@ -72,6 +91,11 @@ def test_rows_of_several_blocks_are_as_each_alone_whatever_their_order_in_memory
 def test_a_node_comes_before_those_that_it_leads_to(detector):
     for tree in DATA["detectors"][detector]["trees"]:
         assert all(min(node[2:]) > number for number, node in enumerate(tree) if len(node) > 1)
+
+
+def test_features_that_a_tree_needs_must_be_there():
+    with pytest.raises(ValueError, match="expected 14 features, got 11"):
+        DetectabilityModel.of({"base": 0.0, "trees": [[[13, 2.0, 1, 2], [-1.0], [1.0]]]}).chances(rows(3)[:, :11])
 
 
 def test_a_tree_by_hand():
@@ -113,7 +137,8 @@ def test_a_detector_that_measures_heights_from_the_sensor_misses_from_high_mount
         row = dict(LOW, log_points=6.0, log_points_on_sides=5.5, length_share=0.98, width_share=0.9, gap_m=20.0,
                    depression_deg=math.degrees(depression_rad), length_m=4.5, range_m=15.0 / math.cos(depression_rad),
                    side=0.7, log_spacing=-2.2)  # fmt: skip
-        return target_scores.detectability_model(detector).chances(np.array([[row[name] for name in FEATURES]]))[0]
+        features = np.array([[row[name] for name in CORRECTION_FEATURES]])
+        return target_scores.detectability_model(detector).chances(features)[0]
 
     assert chance("pointpillars_sensor", 2.0) > 0.5
     assert chance("pointpillars_sensor", 6.0) < 0.2 * chance("pointpillars_sensor", 2.0)

@@ -27,7 +27,7 @@ from egvs.scoring.standard_errors import (
     lag_behind_best,
     summarise_uncertainty,
 )
-from egvs.scoring.target_scores import DETECTORS, detectability_features, detectability_model
+from egvs.scoring.target_scores import DETECTORS, correction_features, detectability_model
 from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.statistics.blocks import means_without_each, standard_error_inflation
@@ -159,7 +159,7 @@ class Twin:
         visible = visible_targets(self.record, Beams.of(scan))
         found = []
         for name in DETECTORS:
-            chances = detectability_model(name).chances(detectability_features(visible)).tolist()
+            chances = detectability_model(name).chances(correction_features(visible)).tolist()
             found.append([p if points > 0 else 0.0 for p, points in zip(chances, visible.points, strict=True)])
         return found
 
@@ -235,7 +235,8 @@ def test_ranking_detectors_are_those_of_the_score_that_ranks() -> None:
     [
         (
             ["score.detector='yolo'"],
-            "score.detector: expected 'all', 'cluster', 'pointpillars' or 'pointpillars_sensor'",
+            "score.detector: expected 'cluster', 'pointpillars', 'pointpillars_sensor', 'cluster_uncorrected', "
+            "'pointpillars_uncorrected', 'all_uncorrected' or 'all'",
         ),
         (
             ["score.detector='cluster'", "score.others=['coverage']", "score.blindspots=false"],
@@ -270,8 +271,8 @@ def test_option_sets_the_key(mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     [
         (
             ("--detector", "yolo"),
-            "--detector: expected cluster, pointpillars, pointpillars_sensor or all, got 'yolo'. "
-            "Use --detector cluster.",
+            "--detector: expected cluster, pointpillars, pointpillars_sensor, cluster_uncorrected, "
+            "pointpillars_uncorrected, all_uncorrected or all, got 'yolo'. Use --detector cluster.",
         ),
         (
             ("--detector", "all", "--set", "score.detector=cluster"),

@@ -111,8 +111,9 @@ def _print_ranking(
 ) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
     hint = ranking_text.recorded_frames_hint(scenario, ranked, record.stages)
-    found = detection_range(read_levels(RunFolder(folder).levels, ranked.sites[0].site))
-    print_sentences([verdict(ranked, hint, scenario.score.ranking_detectors, found)])
+    detectors = scenario.score.ranking_detectors
+    found = detection_range(read_levels(RunFolder(folder).levels, ranked.sites[0].site), detectors)
+    print_sentences([verdict(ranked, hint, detectors, found)])
     for part in read_sections(RunFolder(folder), scenario, record.stages):
         for warning in part.warnings:
             print_sentences([f"{warning.sentence} See {RunFolder(folder).report}#{part.section.name}"])

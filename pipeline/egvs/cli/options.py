@@ -39,7 +39,8 @@ Detector = Annotated[
         "--detector",
         metavar="NAME",
         help="Detector that expected_detections stands for: cluster, pointpillars, all (their mean, the default), or "
-        "pointpillars_sensor, which measures heights from the sensor. Short for --set score.detector=NAME.",
+        "pointpillars_sensor, which measures heights from the sensor; all_uncorrected: before the correction for "
+        "streets. Short for --set score.detector=NAME.",
     ),
 ]
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Number of threads; one per core by default.")]
@@ -80,9 +81,9 @@ def with_detector(overrides: Sequence[str] | None, detector: str | None, path: P
         return list(overrides or ())
 
     from egvs.runs.run_sources import SettingsSource
-    from egvs.scenario.score_config import ALL_DETECTORS, Detector
+    from egvs.scenario.score_config import DetectorChoice
 
-    known = (*get_args(Detector), ALL_DETECTORS)
+    known = get_args(DetectorChoice)
     if detector not in known:
         problem = f"expected {', '.join(known[:-1])} or {known[-1]}, got {detector[:80]!r}"
         raise InputError("--detector", problem, f"Use --detector {known[0]}.")

@@ -503,10 +503,9 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     scenario, ranking, tpog = contents.scenario, contents.ranking, contents.tpog
     has_occlusion = "moving_occlusion" in scenario.effects.named
     setting = egvs_setting(scenario.gamma, tpog.grid.voxel_m, moving_occlusion=has_occlusion)
+    detectors = scenario.score.ranking_detectors
     return {
-        "headline": headline(
-            ranking, bool(tpog.counts.any()), scenario.score.ranking_detectors, detection_range(contents.levels)
-        ),
+        "headline": headline(ranking, bool(tpog.counts.any()), detectors, detection_range(contents.levels, detectors)),
         "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
         "preference": noticed_preference(ranking),

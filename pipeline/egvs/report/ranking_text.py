@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.wording import by_number, format_percent, list_first
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability, join_names
-from egvs.results.levels import MIN_NOTICED_LEAD, DetectionRange
+from egvs.results.levels import MIN_NOTICED_LEAD, DetectionRange, found_text
 from egvs.results.ranking import CLOSE_SHARE, RankedSite, Ranking
 from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
@@ -55,15 +55,18 @@ def level(site: RankedSite, detectors: Sequence[str], found: DetectionRange | No
     Returns
     -------
     str
-        E.g. "detectors (cluster, pointpillars) should find 84.1 % of vehicles; people would notice 90 ± 2 % in its
+        E.g. "detectors (cluster, pointpillars) should find 84 ± 5 % of vehicles; people would notice 90 ± 2 % in its
         sweeps". For a score without detectors it begins with a verb: "sees 60.0 % of vehicles well".
     """
     text = site.by.sentence(site.score)
     if not detectors:
         return text
     if found is not None:
-        untrained = format_percent(found.untrained, 0)
-        text = f"{site.by.says.format(found.text)} (models know nothing of the {untrained} that are not cars)"
+        outside = format_percent(found.outside, 0)
+        measured = " or ".join(found.measured)
+        text = f"{site.by.says.format(found.text)} (nothing is known of the {outside} that are not {measured})"
+    else:
+        text = site.by.says.format(found_text(site.score, detectors, site.score_se))
     if len(detectors) > 1:
         text = f"detectors ({', '.join(detectors)}) {text}"
     else:

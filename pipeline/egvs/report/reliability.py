@@ -25,10 +25,10 @@ _SEEDS_NOTE_OF_DETECTORS = (
     "({}) disagree"
 )
 _SIZE_NOTE = (
-    "The order of sites by this score was validated better than its size: in the study, which was simulated, the "
-    "shares found differed from the expected ones by {} to {} percentage points for the detectors that it stands "
-    "for, and by up to {} for another one (docs/validity.md)."
-).format(*STUDY.larger_study.level_error_points, STUDY.larger_study.largest_level_error_points)
+    "The order of sites by this score was validated better than its size: on simulated streets, the shares found "
+    "differed from the expected ones by {:g} percentage points (root mean square), which the error in the answer "
+    "contains, and for a detector without a model by {:g} (docs/validity.md)."
+)
 _NOTICED_NOTE = (
     "Found: a box overlaps the vehicle by more than 0.7 (IoU); noticed: people label it within 3 m, by curves from one "
     "junction; its ± contains their errors, not how far other places, sensors and people differ (docs/certainty.md)."
@@ -71,7 +71,7 @@ def describe_reliability(
     if ranking.has_errors and (seeds > 1 or ranking.by.name == DEFAULT_SCORE):
         notes.append(_error_note(seeds, "recording" if recordings else "simulation", detectors))
     if ranking.by.name == DEFAULT_SCORE:
-        notes.append(FROM_SENSOR_NOTE if FROM_SENSOR in detectors else _SIZE_NOTE)
+        notes.append(FROM_SENSOR_NOTE if FROM_SENSOR in detectors else _size_note(detectors))
         if best.noticed is not None:
             notes.append(_NOTICED_NOTE)
     if notes:
@@ -87,6 +87,14 @@ def describe_reliability(
     if limits:
         sentences.append(f"The best site has {join_names(limits)}: one beyond what was tried may be better.")
     return sentences
+
+
+def _size_note(detectors: Sequence[str]) -> str:
+    """Return how far the size of the score was validated."""
+    levels = STUDY.street_levels
+    measured = [levels.error_points[name] for name in detectors if name in levels.error_points]
+    points = max(measured or levels.error_points.values())
+    return _SIZE_NOTE.format(points, levels.other_detector_error_points)
 
 
 def _error_note(seeds: int, traffic: str, detectors: Sequence[str]) -> str:

@@ -3,7 +3,11 @@
 A share that rests on what was measured is printed as a number with its error. If more than :data:`MAX_SHARE_OUTSIDE`
 of the vehicles are outside of what it rests on, it is printed as a range: from the share if none of these was found or
 noticed to the share if all of them were, in steps of 5 %. Outside are, for what people notice, those outside the data
-of the curves (:mod:`egvs.scoring.noticed`); for what detectors find, all but :data:`TRAINED_GROUP`.
+of the curves (:mod:`egvs.scoring.noticed`); for what detectors find, all groups but those at which the level of their
+models was measured (:func:`measured_groups`).
+
+The error of what detectors find (:func:`level_error`) contains the level error that was measured on simulated streets.
+If it is larger than :data:`MAX_LEVEL_ERROR`, a range is printed, too.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import ALL_USERS
 from egvs.core.wording import format_percent
 from egvs.results.labels import SCORE_LABELS
+from egvs.results.study_results import STUDY
 from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED
 
 MAX_SHARE_OUTSIDE = 0.1
@@ -25,8 +30,8 @@ MAX_SHARE_OUTSIDE = 0.1
 MIN_NOTICED_LEAD = 0.01
 """Shares noticed that differ by less are taken as equal."""
 
-TRAINED_GROUP = "cars"
-"""The group of road users that the models of detectors were trained on."""
+MAX_LEVEL_ERROR = 0.1
+"""With a larger error, what detectors find is printed as a range."""
 
 _RANGE_STEP = 0.05
 
@@ -126,14 +131,17 @@ class DetectionRange:
     Attributes
     ----------
     low, high
-        The share if none, and if all of the vehicles are found that no model was trained on.
-    untrained
+        The share if none, and if all of the vehicles are found of which the level is not known.
+    outside
         Share of these vehicles.
+    measured
+        The groups of which the level is known.
     """
 
     low: float
     high: float
-    untrained: float
+    outside: float
+    measured: tuple[str, ...]
 
     @property
     def text(self) -> str:
@@ -141,30 +149,70 @@ class DetectionRange:
         return format_range(self.low, self.high)
 
 
-def detection_range(levels: Sequence[GroupLevel]) -> DetectionRange | None:
+def measured_groups(detectors: Sequence[str]) -> tuple[str, ...]:
+    """Return the groups of road users at which the level of these models was measured."""
+    groups = [STUDY.street_levels.groups.get(detector, ("cars",)) for detector in detectors]
+    return tuple(name for name in groups[0] if all(name in group for group in groups)) if groups else ()
+
+
+def level_error(detectors: Sequence[str], se: float | None) -> float:
+    """Return the error of the share that detectors find, as a share; infinite for a detector without measured level.
+
+    Parameters
+    ----------
+    detectors
+        The detectors that the share is the mean over.
+    se
+        Its standard error, from finite traffic and the differences between the detectors; None if it is unknown.
+
+    Examples
+    --------
+    >>> level_error(["pointpillars_sensor"], 0.01)
+    inf
+    """
+    measured = [STUDY.street_levels.error_points.get(detector, math.inf) for detector in detectors]
+    return math.hypot(max(measured, default=math.inf) / 100.0, se or 0.0)
+
+
+def found_text(share: float, detectors: Sequence[str], se: float | None) -> str:
+    """Return the share that detectors find with its error, in per cent, or a range; parameters as in level_error.
+
+    The error is rounded up, and so is not smaller than the measured one.
+    """
+    error = level_error(detectors, se)
+    if error > MAX_LEVEL_ERROR:
+        width = max(MAX_LEVEL_ERROR, error) if math.isfinite(error) else MAX_LEVEL_ERROR
+        return format_range(max(0.0, share - width), share + width)
+    return f"{100.0 * share:.0f} ± {math.ceil(round(100.0 * error, 6))} %"
+
+
+def detection_range(levels: Sequence[GroupLevel], detectors: Sequence[str]) -> DetectionRange | None:
     """Return the range of the share that detectors find from a site, where a number would not be supported.
 
     Parameters
     ----------
     levels
         All groups of road users, from :func:`read_levels`.
+    detectors
+        The detectors that the share is the mean over.
 
     Returns
     -------
     DetectionRange or None
-        None if at most :data:`MAX_SHARE_OUTSIDE` of the vehicles are not of :data:`TRAINED_GROUP`, or if the groups are
-        unknown.
+        None if at most :data:`MAX_SHARE_OUTSIDE` of the vehicles are outside of :func:`measured_groups`, or if the
+        groups are unknown.
     """
-    untrained = math.fsum(level.weight_share for level in levels if level.road_users != TRAINED_GROUP)
-    if not untrained > MAX_SHARE_OUTSIDE:
+    measured = measured_groups(detectors)
+    outside = math.fsum(level.weight_share for level in levels if level.road_users not in measured)
+    if not outside > MAX_SHARE_OUTSIDE:
         return None
-    low = math.fsum(level.weight_share * level.found for level in levels if level.road_users == TRAINED_GROUP)
-    return DetectionRange(low, low + untrained, untrained)
+    low = math.fsum(level.weight_share * level.found for level in levels if level.road_users in measured)
+    return DetectionRange(low, low + outside, outside, measured)
 
 
 GROUPS_NOTE = (
-    "Detectors: models that were trained on cars; they say nothing about vans, trucks and buses. People: curves "
-    "measured for each group."
+    "Detectors: their models, in simulated sweeps; ± is without the error of the level, which the answer has. People: "
+    "curves measured for each group."
 )
 """What the levels of groups mean."""
 

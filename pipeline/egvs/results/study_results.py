@@ -71,6 +71,25 @@ class LargerStudy(_Results):
     roll_deg: float
 
 
+class StreetLevels(_Results):
+    """Level errors of the score on simulated streets that no model was fitted at.
+
+    Attributes
+    ----------
+    error_points
+        By the model of a detector: root mean square error of the share of vehicles found, of the better half of the
+        sites, over all streets; in percentage points, rounded up.
+    other_detector_error_points
+        The same for a detector without a model, compared with the mean of the models.
+    groups
+        By the model of a detector, the groups of road users at which the level was measured and is near enough.
+    """
+
+    error_points: dict[str, float]
+    other_detector_error_points: float
+    groups: dict[str, tuple[str, ...]]
+
+
 class HeightsFromSensor(_Results):
     """The test of the score for a detector that measures heights from the sensor, at one junction.
 
@@ -90,6 +109,7 @@ class StudyResults(BaseModel):
 
     first_study: FirstStudy
     larger_study: LargerStudy
+    street_levels: StreetLevels
     heights_from_sensor: HeightsFromSensor
 
 

@@ -43,15 +43,26 @@ NOTICED: OtherScore = "noticed"
 VEHICLE_SCORES: tuple[OtherScore, ...] = ("expected_detections", "noticed", "seen_well", "points_on_target")
 """Scores that are means over the vehicles of recorded frames."""
 
-Detector = Literal["cluster", "pointpillars", "pointpillars_sensor"]
+Detector = Literal[
+    "cluster", "pointpillars", "pointpillars_sensor", "cluster_uncorrected", "pointpillars_uncorrected"
+]  # fmt: skip
 """Detectors whose detections a model of ``expected_detections`` predicts. ``pointpillars_sensor`` has a model, but is
 not installed: it measures heights from the sensor and was trained 2 m above the ground, as detectors for cars are."""
+
+UNCORRECTED = "_uncorrected"
+"""Ending of the models without the correction for streets."""
 
 FROM_SENSOR: Detector = "pointpillars_sensor"
 """The detector that measures heights from the sensor."""
 
 MEAN_DETECTORS: tuple[Detector, ...] = ("cluster", "pointpillars")
 """The detectors that ``"all"`` stands for; both measure heights from the ground."""
+
+UNCORRECTED_DETECTORS: tuple[Detector, ...] = ("cluster_uncorrected", "pointpillars_uncorrected")
+"""The detectors that ``"all_uncorrected"`` stands for."""
+
+DetectorChoice = Literal[Detector, "all_uncorrected", "all"]
+"""Values of ``[score] detector``."""
 
 ALL_DETECTORS = "all"
 """Value of ``[score] detector``: the mean over :data:`MEAN_DETECTORS`."""
@@ -161,11 +172,12 @@ class ScoreConfig(StrictModel):
     others: tuple[OtherScore, ...] = Field(
         (DEFAULT_SCORE,), description="Further scores in scores.parquet, besides egvs and the score of rank_by"
     )
-    detector: Literal["all", Detector] = Field(
+    detector: DetectorChoice = Field(
         "all",
         description="Detector that expected_detections, blind spots and zones stand for. 'all' is the mean over "
         "cluster and pointpillars; its standard error contains how far they disagree. pointpillars_sensor measures "
-        "heights from the sensor, as detectors for cars do, and misses most from high mounts",
+        "heights from the sensor, as detectors for cars do, and misses most from high mounts. _uncorrected are the "
+        "models before their correction for streets",
     )
     weights: WeightsConfig = WeightsConfig()
     keep_visibility: tuple[str, ...] | Literal["all"] = Field(
@@ -238,6 +250,8 @@ class ScoreConfig(StrictModel):
         """The detectors that detection scores average over."""
         if self.detector == "all":
             return MEAN_DETECTORS
+        if self.detector == "all_uncorrected":
+            return UNCORRECTED_DETECTORS
         return (self.detector,)
 
     @property

@@ -50,6 +50,9 @@ from egvs.scoring.targets import TargetRecord, TargetVisibility
 
 DATA_FILE = Path(__file__).with_name("noticed.json")
 
+CARS = "cars"
+"""Name of the group of cars."""
+
 FARTHEST_M = 80.0
 """The curves were compared with boxes up to this range."""
 

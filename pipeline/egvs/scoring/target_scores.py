@@ -32,8 +32,11 @@ standard error contains how far they disagree (:mod:`egvs.scoring.standard_error
 
 The parameters of the model are in ``target_scores.json`` beside this module. They were trained on the detections of
 each detector at junctions that no result is quoted for (``benchmarks/across_junctions`` fits them again;
-docs/validity.md shows their accuracy elsewhere). A detection is a box that overlaps the vehicle by more than 0.7, in
-the mean of the overlaps from above and in 3D.
+docs/validity.md shows their accuracy elsewhere). Those junctions had few sizes of vehicles and no losses of returns, so
+the models are *corrected for streets*: the logit is scaled and shifted, and further trees are added, which also know
+the size of vehicles that are not cars (``street_corrections.json``, made by ``python -m benchmarks.across_junctions
+levels``). The models without correction have names of their own, such as ``cluster_uncorrected``. A detection
+is a box that overlaps the vehicle by more than 0.7, in the mean of the overlaps from above and in 3D.
 
 *Noticed*: the share of vehicles that people notice in the sweeps, from curves over points that were measured with
 labelled sweeps (:mod:`egvs.scoring.noticed`).
@@ -57,9 +60,9 @@ import numpy as np
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
 from egvs.kernels.boosted_trees import add_tree_values
-from egvs.scenario.score_config import MEAN_DETECTORS, Detector
+from egvs.scenario.score_config import MEAN_DETECTORS, UNCORRECTED, Detector
 from egvs.scoring.blindspots import SpotVisibility
-from egvs.scoring.noticed import noticed_chances
+from egvs.scoring.noticed import CARS, group_members, noticed_chances
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetVisibility, weighted_mean
 
 Gain = Callable[[FloatArray], FloatArray]
@@ -71,10 +74,13 @@ for any detector."""
 
 MODEL_FILE = Path(__file__).with_name("target_scores.json")
 
+CORRECTIONS_FILE = Path(__file__).with_name("street_corrections.json")
+"""Corrections of the models for streets."""
+
 DETECTORS: tuple[str, ...] = MEAN_DETECTORS
 """Detectors that the score is the mean over, unless one is chosen."""
 
-MODELLED: tuple[str, ...] = get_args(Detector)
+MODELLED: tuple[str, ...] = tuple(name for name in get_args(Detector) if not name.endswith(UNCORRECTED))
 """All detectors that have a model."""
 
 ISOLATED_GAP_M = 20.0
@@ -104,6 +110,10 @@ MONOTONICITY = {
 FEATURES = tuple(MONOTONICITY)
 """Features of the model, see :class:`egvs.scoring.targets.TargetVisibility`: logarithms of 1 + points, gaps of at most
 :data:`ISOLATED_GAP_M`, and the logarithm of :func:`point_spacing_m`."""
+
+
+CORRECTION_FEATURES = (*FEATURES, "larger_length_m", "larger_width_m", "larger_height_m")
+"""Features of corrected models: also the size of vehicles that are not cars; 0 for cars."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +214,7 @@ def chances_by_detector(visible: TargetVisibility, detectors: Sequence[str]) -> 
     KeyError
         For a detector without a model.
     """
-    features = detectability_features(visible)
+    features = correction_features(visible)
     chances = np.array([detectability_model(name).chances(features) for name in detectors])
     return np.where(visible.points > 0.0, chances, 0.0)
 
@@ -224,6 +234,13 @@ def detectability_features(visible: TargetVisibility) -> FloatArray:
         visible.side,
         np.log(point_spacing_m(visible)),
     ])  # fmt: skip
+
+
+def correction_features(visible: TargetVisibility) -> FloatArray:
+    """Return :data:`CORRECTION_FEATURES` of what a site sees, (n, g) float64; the first are those of all models."""
+    are_cars = group_members(visible.record)[CARS]
+    sizes_m = np.where(are_cars[:, None], 0.0, visible.record.boxes[:, 3:6])
+    return np.column_stack([detectability_features(visible), sizes_m])
 
 
 def point_spacing_m(visible: TargetVisibility) -> FloatArray:
@@ -284,7 +301,15 @@ class DetectabilityModel:
         return cls(entry["base"], starts, feature, threshold, left, right, value)
 
     def chances(self, features: FloatArray) -> FloatArray:
-        """Return the probability for each row of :data:`FEATURES` (n, f), (n,), 0 to 1."""
+        """Return the probability for each row of :data:`FEATURES` (n, f), or of more features, (n,), 0 to 1.
+
+        Raises
+        ------
+        ValueError
+            If a tree needs a feature that the rows do not have.
+        """
+        if self.feature.max(initial=-1) >= features.shape[1]:
+            raise ValueError(f"expected {self.feature.max() + 1} features, got {features.shape[1]}")
         columns = np.ascontiguousarray(features.T)
         logit = np.full(len(features), self.base)
         nodes = self.feature, self.threshold, self.left, self.right, self.value
@@ -295,8 +320,39 @@ class DetectabilityModel:
 
 @cache
 def detectability_model(detector: str) -> DetectabilityModel:
-    """Return the model of one of :data:`MODELLED`."""
-    return DetectabilityModel.of(json.loads(MODEL_FILE.read_text(encoding="utf-8"))["detectors"][detector])
+    """Return the model of one of :data:`MODELLED`; of ``NAME_uncorrected``, the one without correction."""
+    if detector.endswith(UNCORRECTED):
+        return uncorrected_model(detector.removesuffix(UNCORRECTED))
+    correction = json.loads(CORRECTIONS_FILE.read_text(encoding="utf-8"))["detectors"].get(detector)
+    if correction is None:
+        return uncorrected_model(detector)
+    return DetectabilityModel.of(corrected_entry(_model_entry(detector), correction))
+
+
+@cache
+def uncorrected_model(detector: str) -> DetectabilityModel:
+    """Return the model of one of :data:`MODELLED` without correction for streets."""
+    return DetectabilityModel.of(_model_entry(detector))
+
+
+def _model_entry(detector: str) -> dict[str, Any]:
+    entry: dict[str, Any] = json.loads(MODEL_FILE.read_text(encoding="utf-8"))["detectors"][detector]
+    return entry
+
+
+def corrected_entry(entry: Mapping[str, Any], correction: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an entry of the file of models with its correction.
+
+    Parameters
+    ----------
+    entry
+        ``base`` and ``trees`` of a model.
+    correction
+        ``scale``, by which the leaves are multiplied, the new ``base``, and further ``trees``.
+    """
+    scale = correction["scale"]
+    trees = [[[scale * node[0]] if len(node) == 1 else node for node in tree] for tree in entry["trees"]]
+    return {"base": correction["base"], "trees": [*trees, *correction["trees"]]}
 
 
 def expected_by_points(points: FloatArray) -> FloatArray:

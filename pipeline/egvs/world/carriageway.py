@@ -174,7 +174,8 @@ def _outlines(shapes: Sequence[Shape]) -> NDArray[Any]:
     import shapely
 
     rings = [shape.shape_m[:, :2] for shape in shapes]
-    polygons = np.array([shapely.Polygon(ring) for ring in rings], dtype=object)
-    # areas only: GEOS cannot subtract a collection that contains lines
-    outlines: NDArray[Any] = shapely.make_valid(polygons, method="structure", keep_collapsed=False)
-    return outlines
+    polygons: NDArray[Any] = np.array([shapely.Polygon(ring) for ring in rings], dtype=object)
+    # areas only: GEOS cannot subtract a collection that contains lines; of a thin bow tie it may make an invalid one
+    for _ in range(2):
+        polygons = shapely.make_valid(polygons, method="structure", keep_collapsed=False)
+    return polygons

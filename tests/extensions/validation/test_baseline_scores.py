@@ -10,9 +10,12 @@ import pytest
 
 from egvs.artefacts.tpog import Tpog
 from egvs.core.grid import Grid
+from egvs.effects.range_limit import RangeLimit
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.validation import baseline_scores
 from egvs.extensions.validation.surrogates import Occupancy, SiteEvidence
 from egvs.extensions.validation.target_points import TargetPoints, list_target_points
+from egvs.scenario.effects_config import RangeLimitParameters
 from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors import sensor
@@ -75,18 +78,28 @@ def test_nuc_equals_slow_twin(count):
     for centre in returns[centres, :2].tolist():
         away = np.hypot(returns[:, 0] - centre[0], returns[:, 1] - centre[1])
         values.append(weight[away <= 0.7].sum() / (n * p))
-    mean = sum(values) / len(values)
-    assert result == pytest.approx(math.sqrt(sum((v - mean) ** 2 for v in values) / len(values)), rel=1e-9)
+    of_disc = weight[centres].tolist()
+    mean = sum(w * v for w, v in zip(of_disc, values, strict=True)) / sum(of_disc)
+    variance = sum(w * (v - mean) ** 2 for w, v in zip(of_disc, values, strict=True)) / sum(of_disc)
+    assert result == pytest.approx(math.sqrt(variance), rel=1e-9)
+
+
+def test_nuc_with_improbable_returns_is_nearly_that_without_them():
+    random = np.random.default_rng(5)
+    returns = np.column_stack([random.uniform(0, 10, 80), random.uniform(1, 3, 80), np.full(80, 0.1)])
+    weight = np.where(np.arange(80) < 40, 1.0, 1e-9)
+    assert nuc(ground_evidence(returns, weight=weight)) == pytest.approx(nuc(ground_evidence(returns[:40])), rel=1e-6)
 
 
 # ---- vehicle grid occupancy
 
 
-def car_evidence(at_m, size_m=(4.0, 2.0, 1.0), vehicles=1, of=None):
-    """Vehicles of one size with these points, positions from the centre."""
+def car_evidence(at_m, size_m=(4.0, 2.0, 1.0), vehicles=1, of=None, probability=None):
+    """Vehicles of one size with these points, positions from the centre; certain without probabilities."""
     boxes = np.tile([0.0, 0.0, 0.0, *size_m, 0.0], (vehicles, 1))
     at = np.asarray(at_m, dtype=np.float64).reshape(-1, 3)
-    points = TargetPoints(np.zeros(len(at), dtype=np.int64) if of is None else np.asarray(of), at)
+    of = np.zeros(len(at), dtype=np.int64) if of is None else np.asarray(of)
+    points = TargetPoints(of, at, np.ones(len(at)) if probability is None else np.asarray(probability))
     return SimpleNamespace(vehicles=SimpleNamespace(record=SimpleNamespace(boxes=boxes)), vehicle_points=points)
 
 
@@ -106,6 +119,14 @@ def test_occupied_cells_of_a_corner_by_hand():
     assert occupancy(car) == pytest.approx((h(1 / 4) + h(1 / 2) + h(1)) / 3)
     assert occupancy(car, entropy="term") == pytest.approx((0.5 + 0.5 + 0.0) / 3)
     assert occupancy(car, views="together") == pytest.approx(h(6 / 14))
+
+
+def test_improbable_points_occupy_cells_in_expectation():
+    # from above: a cell with two points of .5, one with a point of .2, and a certain one: .75 + .2 + 1 of 8 cells;
+    # from the side .75 + .2 + 1 of 4; from ahead, where the first two cells are one, 1 - .5 .5 .8 = .8 and 1 of 2
+    at = [[1.9, -0.9, 0.4], [1.2, -0.1, 0.2], [0.5, -0.5, 0.0], [-1.9, 0.9, -0.4]]
+    car = car_evidence(at, probability=[0.5, 0.5, 0.2, 1.0])
+    assert occupancy(car, entropy="share") == pytest.approx((1.95 / 8 + 1.95 / 4 + 1.8 / 2) / 3)
 
 
 def test_points_on_faces_belong_to_the_outermost_cells():
@@ -177,6 +198,7 @@ def test_points_are_those_that_are_counted(lost):
     if lost:
         expected = visible_targets(record, beams, probability).points
         np.testing.assert_array_equal(counts, expected)
+        np.testing.assert_array_equal(points.probability, 1.0)
         assert counts.sum() < seen.points.sum()
         return
     np.testing.assert_array_equal(counts, seen.points)
@@ -186,3 +208,19 @@ def test_points_are_those_that_are_counted(lost):
     for row in np.flatnonzero(counts):
         at = points.at_m[points.vehicle == row]
         assert np.ptp(at[:, 0]) / record.boxes[row, 3] == pytest.approx(seen.length_share[row], abs=1e-9)
+
+
+def test_probabilities_of_points_add_up_to_the_expected_number():
+    """With losses by range and class of vehicle, as the scores count them."""
+    random = np.random.default_rng(11)
+    grid = Grid((-30.0, -30.0, 0.0), 0.5, (120, 120, 10))
+    record = TargetRecord.of([random_frame(random, (0.0, 0.0, 0.0), number=n) for n in range(3)], grid)
+    os1 = sensor.CATALOGUE["OS1-64"]
+    beams = Beams(Pose(-5.0, 3.0, 4.0), os1, os1.directions() * 60.0)
+    losses = ReturnProbability((RangeLimit(RangeLimitParameters()),), os1)
+    points = list_target_points(record, beams, losses)
+    expected = visible_targets(record, beams, losses).points
+    summed = np.bincount(points.vehicle, points.probability, minlength=len(record))
+    np.testing.assert_allclose(summed, expected, rtol=1e-3, atol=1e-9)
+    assert 0.0 < points.probability.max() < 1.0
+    assert summed.sum() < 0.9 * len(points.vehicle)

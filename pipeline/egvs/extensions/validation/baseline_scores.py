@@ -7,6 +7,7 @@ the area of road and sidewalk,
 
 .. math:: NUC = \sqrt{\frac{1}{D} \sum_i \left( \frac{n_i}{N p} - \overline{n / (N p)} \right)^2}
 
+With effects that lose returns, each return counts with its probability, as a centre too.
 The released program takes a rectangle for the area, which scales the value of all sites of a junction alike. Not
 stated: how returns are drawn where there are fewer than 6000 (here: each of them once). Labels of the surface come from
 CARLA there. Here the road is where the TPOG has traffic; the sidewalk is what lies within ``sidewalk_m`` of it.
@@ -30,7 +31,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from scipy.special import entr
 
-from egvs.core.grid import FloatArray
+from egvs.core.grid import FloatArray, IntArray
 from egvs.extensions.validation.surrogates import SiteEvidence, SurrogateScore
 
 # ---- normalised uniformity coefficient
@@ -54,15 +55,15 @@ def nuc(evidence: SiteEvidence, sidewalk_m: float) -> float:
     total = math.fsum(weight)
     if not total > 0.0:
         return math.nan
-    counts = _disc_weights(xy_m, weight)
-    share = counts / (total * (math.pi * DISC_RADIUS_M**2 / area_m2))
-    mean = math.fsum(share) / len(share)
-    return math.sqrt(math.fsum((share - mean) ** 2) / len(share))
-
-
-def _disc_weights(xy_m: FloatArray, weight: FloatArray) -> FloatArray:
-    """Return the weight of the returns in each disc, (discs,)."""
     centres = np.random.default_rng(_SEED).permutation(len(xy_m))[:DISCS]
+    share = _disc_weights(xy_m, weight, centres) / (total * (math.pi * DISC_RADIUS_M**2 / area_m2))
+    of_centre = weight[centres]
+    mean = math.fsum(of_centre * share) / math.fsum(of_centre)
+    return math.sqrt(math.fsum(of_centre * (share - mean) ** 2) / math.fsum(of_centre))
+
+
+def _disc_weights(xy_m: FloatArray, weight: FloatArray, centres: IntArray) -> FloatArray:
+    """Return the weight of the returns in the disc around each centre, (discs,)."""
     tree = cKDTree(xy_m)
     if (weight == 1.0).all():
         counts: FloatArray = tree.query_ball_point(xy_m[centres], DISC_RADIUS_M, return_length=True).astype(np.float64)
@@ -127,17 +128,23 @@ def vehicle_grid_occupancy(evidence: SiteEvidence, cell_m: float, views: str, en
 
 
 def occupied_cells(evidence: SiteEvidence, axes: tuple[int, int], cell_m: float) -> tuple[FloatArray, FloatArray]:
-    """Return the number of cells with a point, and of all cells, of each vehicle in one view, (n,) each."""
+    """Return the expected number of cells with a point, and of all cells, of each vehicle in one view, (n,) each.
+
+    Points are detected independently of each other, so a cell is empty with the product of the probabilities that each
+    of its points is lost.
+    """
     size_m = evidence.vehicles.record.boxes[:, 3:6][:, axes]
-    vehicle, at_m = evidence.vehicle_points
+    vehicle, at_m, probability = evidence.vehicle_points
     shape = np.maximum(np.ceil(size_m / cell_m - 1e-9), 1.0).astype(np.int64)
     cells = shape.prod(axis=1)
     first = np.append(0, np.cumsum(cells))
     index = np.floor((at_m[:, axes] + size_m[vehicle] / 2.0) / cell_m).astype(np.int64)
     index = np.clip(index, 0, shape[vehicle] - 1)
-    is_occupied = np.zeros(first[-1], dtype=np.int64)
-    is_occupied[first[vehicle] + index[:, 0] * shape[vehicle, 1] + index[:, 1]] = 1
-    return np.add.reduceat(is_occupied, first[:-1]).astype(np.float64), cells.astype(np.float64)
+    cell = first[vehicle] + index[:, 0] * shape[vehicle, 1] + index[:, 1]
+    with np.errstate(divide="ignore"):  # a point that is certain
+        log_empty = np.bincount(cell, np.log1p(-probability), minlength=first[-1])
+    occupied = 0.0 - np.expm1(log_empty)
+    return np.add.reduceat(occupied, first[:-1]), cells.astype(np.float64)
 
 
 def _entropy_bit(share: FloatArray, entropy: str) -> FloatArray:

@@ -224,7 +224,7 @@ class SiteEvidence:
 
     @cached_property
     def vehicle_points(self) -> TargetPoints:
-        """Positions of the points on the same vehicles; where effects lose returns, those of any probability."""
+        """Positions of the points on the same vehicles, and the probability of each."""
         return list_target_points(self.vehicles.record, self.beams, self.detection_probability)
 
 

@@ -6,14 +6,14 @@ ends on the first box that it enters. That module counts these points; this one 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from egvs.core.grid import FloatArray, IntArray
+from egvs.effects.returns import ReturnProbability
 from egvs.kernels import vehicle_visibility
-from egvs.scoring.targets import MAX_HITS, NO_LOSSES, TargetRecord, sort_beams
+from egvs.scoring.targets import MAX_HITS, NO_LOSSES, ByRange, TargetRecord, sort_beams
 from egvs.scoring.visibility import Beams
 
 
@@ -27,15 +27,16 @@ class TargetPoints(NamedTuple):
     at_m
         Position from the centre of the vehicle's box along its length (to the front), its width (to the left) and its
         height, (k, 3) float64, metres.
+    probability
+        Probability that each is detected, times the weight of its beam, (k,) float64, above 0 and at most 1.
     """
 
     vehicle: IntArray
     at_m: FloatArray
+    probability: FloatArray
 
 
-def list_target_points(
-    record: TargetRecord, beams: Beams, return_probability: Callable[[FloatArray], FloatArray] | None = None
-) -> TargetPoints:
+def list_target_points(record: TargetRecord, beams: Beams, return_probability: ByRange | None = None) -> TargetPoints:
     """Return the points of one site on the vehicle-frames of a record, with occlusion by all other boxes.
 
     Parameters
@@ -45,8 +46,8 @@ def list_target_points(
     beams
         The site's empty scan.
     return_probability
-        Probability that a return from each range (n,) is detected; 1 where it is None. A point of any probability
-        above 0 is listed.
+        As for :func:`egvs.scoring.targets.visible_targets`. Points of probability 0 are left out, so the sum over the
+        others is the expected number of points.
     """
     boxes, count = record.all_boxes, len(record.all_boxes.values)
     sensor_m = record.grid.to_grid_m(np.asarray(beams.pose.position_m))
@@ -59,22 +60,26 @@ def list_target_points(
     capacity = max(MAX_HITS, len(ordered.length_m))
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
-    vehicles, positions_m = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]
+    vehicles, positions_m, probabilities = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))], [np.empty(0)]
     frame, nearest_m, alone = 0, ordered.length_m.copy(), np.zeros(count)
     while frame < len(record.numbers):
         frame, filled = vehicle_visibility.first_hits(
             frame, sensor_m, size_m, all_boxes, tuple(ordered), nearest_m, tuple(NO_LOSSES), (alone, *unused), hits
         )
         box, beam, range_m, along_m, across_m = (column[:filled] for column in hits)
-        is_point = ordered.weight[beam] > 0.0
-        if return_probability is not None:
-            is_point &= return_probability(range_m) > 0.0
+        probability = ordered.weight[beam]
+        if isinstance(return_probability, ReturnProbability):
+            probability = probability * return_probability(range_m, record.reflectivity[row_of_box[box]])
+        elif return_probability is not None:
+            probability = probability * return_probability(range_m)
+        is_point = probability > 0.0
         box, beam, range_m = box[is_point], beam[is_point], range_m[is_point]
         from_centre_m = sensor_m + range_m[:, None] * ordered.directions[:, beam].T - boxes.values[box, :3]
         up_m = _up_m(from_centre_m, boxes.values[box, 3], boxes.values[box, 4])
         vehicles.append(row_of_box[box])
         positions_m.append(np.column_stack([along_m[is_point], across_m[is_point], up_m]))
-    return TargetPoints(np.concatenate(vehicles), np.concatenate(positions_m))
+        probabilities.append(probability[is_point])
+    return TargetPoints(np.concatenate(vehicles), np.concatenate(positions_m), np.concatenate(probabilities))
 
 
 def _up_m(from_centre_m: FloatArray, yaw_rad: FloatArray, pitch_rad: FloatArray) -> FloatArray:
