@@ -12,7 +12,7 @@ import pytest
 from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan
 from egvs.formats.spreadsheets import parse_rows, read_rows
-from tests.formats.workbooks import write_ods, write_xlsx
+from tests.formats.workbooks import encrypted_workbook, write_ods, write_xlsx
 
 Row = tuple[str, dict[str, str]]
 
@@ -87,6 +87,14 @@ def test_commas_in_other_texts_stay(tmp_path: Path) -> None:
         (b'a,b\n"1"x,2\n', r"t.csv: line 2: is not CSV"),
         (b"a|b\n1|2\n", r"t.csv: the columns are separated by '\|'. Use commas or semicolons"),
         (b"a;b\n1;2,500\n", r"t.csv: line 2: b: 2,500 can mean 2500 or 2.500"),
+        (b"a;b\n1;2,5\n1;1.500\n", r"t.csv: line 3: b: 1.500 can mean 1500 or 1.500"),
+        (
+            b"Sites of the town,,\n,,\na,b\n1,2\n",
+            r"t.csv: line 1: .* got 'Sites of the town' alone. Remove",
+        ),
+        (b"# by hand\na,b\n1,2\n", r"t.csv: line 1: expected the names of the columns, got '# by hand' alone"),
+        (b"<html><table><tr><td>a</td></tr></table></html>", r"t.csv: expected a table, got HTML or XML"),
+        (b'<?xml version="1.0"?><Workbook/>', r"t.csv: expected a table, got HTML or XML"),
         (b"", r"t.csv: expected a header and rows, got no values"),
         (b"a,b\n\x81,2\n", r"t.csv: is no text in a known encoding \(byte 4\)"),
         (b"a,b\n1\0,2\n", r"t.csv: is no text: it has the control character"),
@@ -181,6 +189,30 @@ def test_damaged_workbook(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "t.xlsx"
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"t\.xlsx: cannot be read as a workbook"):
+        read(path)
+
+
+@pytest.mark.system
+def test_errors_of_formulas_are_not_empty_cells(tmp_path: Path) -> None:
+    path = tmp_path / "t.xlsx"
+    write_xlsx(path, {"Other": (("x", "#REF!"),), "Sites": (("a", "b"), ("k", "#DIV/0!"))}, hidden=("Other",))
+    assert read(path) == [(f"{path}: row 2", {"a": "k", "b": "#DIV/0!"})]
+
+
+@pytest.mark.system
+def test_archive_of_other_files_is_no_damaged_workbook(tmp_path: Path) -> None:
+    path = tmp_path / "t.xlsx"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("sites.csv", "a,b\n1,2\n")
+    with pytest.raises(InputError, match=r"t\.xlsx: expected a workbook, got a ZIP archive of other files. Unpack it"):
+        read(path)
+
+
+@pytest.mark.system
+def test_workbook_with_a_password_is_no_damaged_file(tmp_path: Path) -> None:
+    path = tmp_path / "t.xlsx"
+    path.write_bytes(encrypted_workbook())
+    with pytest.raises(InputError, match=r"t\.xlsx: the workbook is protected by a password"):
         read(path)
 
 

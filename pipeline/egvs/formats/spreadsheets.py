@@ -5,7 +5,7 @@ Text is UTF-8, UTF-16 with a byte order mark, or Windows-1252. The first row wit
 and columns without any value are skipped, as spreadsheets keep those that were emptied.
 
 ``8,5`` is the number 8.5. Where each such cell of a table could also be a number of thousands (``1,500``), the table is
-rejected.
+rejected; so is one with decimal commas where each cell with a point could be (``1.500``).
 
 Workbooks (xlsx, xls, ods) are read by calamine (``pip install 'egvs[tables]'``) in another process
 (:mod:`egvs.formats.reader_process`), which this module also is the program of. The values that a spreadsheet has
@@ -16,9 +16,11 @@ from __future__ import annotations
 
 import csv
 import datetime
+import functools
 import io
 import json
 import re
+import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,11 +39,14 @@ SUFFIXES = (".csv", ".xlsx", ".xls", ".ods")
 MAX_COLUMNS = 500
 _MODULE = "egvs.formats.spreadsheets"
 _WORKBOOK_SIGNATURES = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1")  # ZIP (xlsx, ods), OLE (xls)
+_CELL_POSITION = re.compile(r"([A-Z]{1,3})([0-9]{1,7})")
 _CONTROL_CHARACTER = re.compile("[\x00-\x08\x0e-\x1f]")
 _SEPARATORS = (",", ";", "\t")
 _SEPARATOR_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
 _COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
-_THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
+_THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}[,.][0-9]{3}")
+_POINT_NUMBER = re.compile(r"[+-]?[0-9]+\.[0-9]+([eE][+-]?[0-9]+)?")
+_MARKUP = re.compile(r"\s*<(?:[!?]|html|table)", re.IGNORECASE)
 _SAVE_HINT = "Save it as CSV in UTF-8."
 _MAX_NAMED = 5
 
@@ -146,7 +151,13 @@ def _make_table(where: str, unit: str, rows: Iterable[tuple[int, list[str]]]) ->
     rows = [(number, cells) for number, cells in rows if any(cells)]
     if not rows:
         raise InputError(where, "expected a header and rows, got no values", "Write one row per item.")
-    header = rows.pop(0)[1]
+    first, header = rows.pop(0)
+    titles = [cell for cell in header if cell]
+    if len(titles) == 1 and rows and sum(map(bool, rows[0][1])) > 1:
+        problem = f"expected the names of the columns, got {titles[0][:80]!r} alone"
+        raise InputError(
+            f"{where}: {unit} {first}", problem, "Remove what is above the names, or check the separators."
+        )
     if len(header) > MAX_COLUMNS:
         problem = f"expected at most {MAX_COLUMNS} columns, got {len(header):,}"
         raise InputError(where, problem, "Remove columns that are not needed.")
@@ -169,21 +180,29 @@ def _make_table(where: str, unit: str, rows: Iterable[tuple[int, list[str]]]) ->
 
 
 def _use_decimal_points(table: _Table) -> None:
-    """Replace decimal commas by points; InputError where each of them could separate thousands."""
-    with_comma = [
+    """Replace decimal commas by points; InputError where they, or the points beside them, can separate thousands."""
+    with_comma = _find_cells(table, _COMMA_NUMBER)
+    if not with_comma:
+        return
+    for numbers in (with_comma, _find_cells(table, _POINT_NUMBER)):
+        if numbers and all(_THOUSANDS.fullmatch(cells[column]) for _, column, cells in numbers):
+            number, column, cells = numbers[0]
+            value = cells[column]
+            problem = f"{value} can mean {re.sub('[,.]', '', value)} or {value.replace(',', '.')}"
+            where = f"{table.locate(number)}: {table.header[column]}"
+            raise InputError(where, problem, "Use no separators of thousands, and a decimal point.")
+    for _, column, cells in with_comma:
+        cells[column] = cells[column].replace(",", ".")
+
+
+def _find_cells(table: _Table, pattern: re.Pattern[str]) -> list[tuple[int, int, list[str]]]:
+    """Return row number, column and row of each cell that a pattern matches."""
+    return [
         (number, column, cells)
         for number, cells in table.rows
         for column, cell in enumerate(cells)
-        if "," in cell and _COMMA_NUMBER.fullmatch(cell)
+        if pattern.fullmatch(cell)
     ]
-    if with_comma and all(_THOUSANDS.fullmatch(cells[column]) for _, column, cells in with_comma):
-        number, column, cells = with_comma[0]
-        value = cells[column]
-        problem = f"{value} can mean {value.replace(',', '')} or {value.replace(',', '.')}"
-        where = f"{table.locate(number)}: {table.header[column]}"
-        raise InputError(where, problem, "Use no separators of thousands, and a decimal point.")
-    for _, column, cells in with_comma:
-        cells[column] = cells[column].replace(",", ".")
 
 
 # ---- text
@@ -191,6 +210,8 @@ def _use_decimal_points(table: _Table) -> None:
 
 def _read_text(path: Path, data: bytes) -> _Table:
     text = _decode(path, data)
+    if _MARKUP.match(text):
+        raise InputError(path, "expected a table, got HTML or XML", "Save it as a workbook (xlsx) or as CSV.")
     first_line, _, rest = text.partition("\n")
     skipped = 0
     named = _SEPARATOR_LINE.fullmatch(first_line.strip(" \r"))
@@ -268,12 +289,17 @@ def _read_workbook(path: Path) -> Iterator[_Table]:
 
 
 def _serve_workbook() -> None:
-    from python_calamine import CalamineWorkbook, SheetTypeEnum, SheetVisibleEnum
+    from python_calamine import CalamineWorkbook, PasswordError, SheetTypeEnum, SheetVisibleEnum
 
     from egvs.formats.reader_process import Block, serve
 
     def read(path: Path) -> Iterator[Block]:
-        book = CalamineWorkbook.from_path(path)
+        if _is_archive_of_other_files(path):
+            raise InputError(path, "expected a workbook, got a ZIP archive of other files", "Unpack it.")
+        try:
+            book = CalamineWorkbook.from_path(path)
+        except PasswordError:
+            raise InputError(path, "the workbook is protected by a password", "Save it without one.") from None
         for sheet in book.sheets_metadata:
             if sheet.visible != SheetVisibleEnum.Visible or sheet.typ != SheetTypeEnum.WorkSheet:
                 continue
@@ -285,12 +311,61 @@ def _serve_workbook() -> None:
                 problem = f"expected at most {MAX_COLUMNS} columns, got {columns:,}"
                 raise InputError(f"{path}: sheet {sheet.name!r}", problem, "Remove columns that are not needed.")
             rows = enumerate(content.iter_rows(), start=content.start[0] + 1)
+            error_cells = _error_cells(path, sheet.name)
             for number, cells in rows:
                 texts = [_cell_text(cell) for cell in cells]
+                for column, error in error_cells.get(number, {}).items():
+                    texts[column - content.start[1]] = error
                 if any(texts):
                     yield Block({"sheet": sheet.name, "row": number}, json.dumps(texts).encode())
 
     serve(read)
+
+
+def _is_archive_of_other_files(path: Path) -> bool:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return not {"[Content_Types].xml", "content.xml"} & set(archive.namelist())
+    except zipfile.BadZipFile:
+        return False
+
+
+def _error_cells(path: Path, sheet: str) -> dict[int, dict[int, str]]:
+    """Return the errors of formulas in a sheet of an xlsx file, such as ``#DIV/0!``; calamine returns empty cells.
+
+    They are by row (from 1) and column (from 0).
+    """
+    from defusedxml.ElementTree import iterparse
+
+    errors: dict[int, dict[int, str]] = {}
+    if not zipfile.is_zipfile(path):
+        return errors
+    with zipfile.ZipFile(path) as archive:
+        if (member := _sheet_member(archive, sheet)) not in archive.namelist():
+            return errors
+        with archive.open(member) as content:
+            for _, element in iterparse(content, ("end",)):
+                position = _CELL_POSITION.fullmatch(element.get("r", ""))
+                if element.tag.endswith("}c") and element.get("t") == "e" and position is not None:
+                    column = functools.reduce(lambda number, letter: 26 * number + ord(letter) - 64, position[1], 0) - 1
+                    errors.setdefault(int(position[2]), {})[column] = "".join(element.itertext())
+                if element.tag.endswith("}row"):
+                    element.clear()
+    return errors
+
+
+def _sheet_member(archive: zipfile.ZipFile, sheet: str) -> str:
+    """Return the name of the file in an xlsx file that has a sheet; an empty text where there is none."""
+    from defusedxml.ElementTree import parse
+
+    try:
+        with archive.open("xl/workbook.xml") as workbook, archive.open("xl/_rels/workbook.xml.rels") as links:
+            sheets = {entry.get("name"): entry for entry in parse(workbook).iter() if entry.tag.endswith("}sheet")}
+            targets = {link.get("Id"): link.get("Target", "") for link in parse(links).iter()}
+    except KeyError:
+        return ""
+    target = next((targets[value] for value in sheets[sheet].attrib.values() if value in targets), "")
+    return target.removeprefix("/") if target.startswith("/") else f"xl/{target}"
 
 
 def _cell_text(value: object) -> str:

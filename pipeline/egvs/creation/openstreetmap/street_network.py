@@ -29,7 +29,7 @@ from egvs.core.grid import XY
 from egvs.creation import junctions
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.creation.openstreetmap import ATTRIBUTION, street_turns
-from egvs.creation.openstreetmap.restrictions import restrictions_of_pieces
+from egvs.creation.openstreetmap.restrictions import is_restriction, restrictions_of_pieces
 from egvs.creation.plain_network import NETWORK_FILE
 from egvs.formats import xml
 from egvs.formats.osm import OsmExtract, Way, parse_number
@@ -462,7 +462,7 @@ def _write_streets(extract: OsmExtract, xml: Path) -> None:
             nodes = [n for n in way.nodes if n in extract.nodes]
             writer.add_way(mutable.Way(id=way.id, nodes=nodes, tags=sorted(way.tags.items())))
         for relation in extract.relations:
-            if relation.tags.get("type") == "restriction":
+            if is_restriction(relation):
                 members = [(member.type[0], member.id, member.role) for member in relation.members]
                 tags = sorted(relation.tags.items())
                 writer.add_relation(mutable.Relation(id=relation.id, members=members, tags=tags))

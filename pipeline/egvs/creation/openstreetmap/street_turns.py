@@ -611,6 +611,10 @@ def _restriction_notes(graph: StreetGraph) -> Iterator[str]:
         in_network = [str(relation) for relation in relations if graph.is_in_network(relation)]
         if in_network:
             yield f"Turn restrictions that hold {what}: {_count(in_network)}."
+    without_turn = [str(relation) for relation in restrictions.without_turn if graph.is_in_network(relation)]
+    if without_turn:
+        what = "whose streets do not meet at their via, and which are left out"
+        yield f"Turn restrictions {what}: {_count(without_turn)}."
     if beyond := graph.beyond_junctions():
         yield (
             "Turn restrictions that lead over a street between two junctions, which SUMO cannot express; the turns stay"
