@@ -7,28 +7,25 @@ and columns without any value are skipped, as spreadsheets keep those that were 
 ``8,5`` is the number 8.5. Where each such cell of a table could also be a number of thousands (``1,500``), the table is
 rejected; so is one with decimal commas where each cell with a point could be (``1.500``).
 
-Workbooks (xlsx, xls, ods) are read by calamine (``pip install 'egvs[tables]'``) in another process
-(:mod:`egvs.formats.reader_process`), which this module also is the program of. The values that a spreadsheet has
-computed are read, not the formulas. Of several sheets, one must have the header that is expected.
+Workbooks (xlsx, xls, ods) are read by :mod:`egvs.formats.workbooks`. Of several sheets, one must have the expected
+header.
 """
 
 from __future__ import annotations
 
 import csv
-import datetime
-import functools
 import io
-import json
 import re
-import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from egvs.core import limits, plugins
+from egvs.core import limits
 from egvs.core.errors import InputError, raise_together
 from egvs.core.wording import list_first
+from egvs.formats import workbooks
+from egvs.formats.workbooks import MAX_COLUMNS
 
 CheckHeader = Callable[[list[str]], list[str]]
 """Returns the names of columns under which values are given; raises an InputError where they are not valid."""
@@ -36,10 +33,7 @@ CheckHeader = Callable[[list[str]], list[str]]
 Parsed = TypeVar("Parsed")
 
 SUFFIXES = (".csv", ".xlsx", ".xls", ".ods")
-MAX_COLUMNS = 500
-_MODULE = "egvs.formats.spreadsheets"
 _WORKBOOK_SIGNATURES = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1")  # ZIP (xlsx, ods), OLE (xls)
-_CELL_POSITION = re.compile(r"([A-Z]{1,3})([0-9]{1,7})")
 _CONTROL_CHARACTER = re.compile("[\x00-\x08\x0e-\x1f]")
 _SEPARATORS = (",", ";", "\t")
 _SEPARATOR_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
@@ -224,11 +218,20 @@ def _read_text(path: Path, data: bytes) -> _Table:
             raise InputError(path, "the columns are separated by '|'", "Use commas or semicolons.")
     table = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True, strict=True)
     try:
-        rows = [(table.line_num + skipped, cells) for cells in table]
+        rows = [(table.line_num + skipped, cells) for cells in _rows_with_values(path, table)]
     except csv.Error as error:
         line = table.line_num + skipped
         raise InputError(f"{path}: line {line}", f"is not CSV ({error})", "Check the quotes.") from None
     return _make_table(str(path), "line", rows)
+
+
+def _rows_with_values(path: Path, table: Iterable[list[str]]) -> Iterator[list[str]]:
+    count = 0
+    for cells in table:
+        if any(cells):
+            count += 1
+            workbooks.check_row_count(path, count)
+            yield cells
 
 
 def _decode(path: Path, data: bytes) -> str:
@@ -274,120 +277,7 @@ def _choose_sheet(path: Path, sheets: list[_Table], check_header: CheckHeader) -
 
 def _read_workbook(path: Path) -> Iterator[_Table]:
     """Yield the visible sheets that have values."""
-    plugins.require_libraries(f"{path.name}: reading a workbook", "tables", "python_calamine")
-    from egvs.formats.reader_process import read_blocks
-
-    sheets: dict[str, list[tuple[int, list[str]]]] = {}
-    size = 0
-    for block in read_blocks(_MODULE, path, str(path), "cannot be read as a workbook"):
-        size += len(block.content)
-        limits.DOCUMENT.check_bytes(path, size, f"has tables of {size / limits.MB:,.0f} MB")
-        sheets.setdefault(block.values["sheet"], []).append((block.values["row"], json.loads(bytes(block.content))))
+    sheets = workbooks.read_sheets(path)
     for name, rows in sheets.items():
         where = str(path) if len(sheets) == 1 else f"{path}: sheet {name!r}"
         yield _make_table(where, "row", rows)
-
-
-def _serve_workbook() -> None:
-    from python_calamine import CalamineWorkbook, PasswordError, SheetTypeEnum, SheetVisibleEnum
-
-    from egvs.formats.reader_process import Block, serve
-
-    def read(path: Path) -> Iterator[Block]:
-        if _is_archive_of_other_files(path):
-            raise InputError(path, "expected a workbook, got a ZIP archive of other files", "Unpack it.")
-        try:
-            book = CalamineWorkbook.from_path(path)
-        except PasswordError:
-            raise InputError(path, "the workbook is protected by a password", "Save it without one.") from None
-        for sheet in book.sheets_metadata:
-            if sheet.visible != SheetVisibleEnum.Visible or sheet.typ != SheetTypeEnum.WorkSheet:
-                continue
-            content = book.get_sheet_by_name(sheet.name)
-            if content.start is None or content.end is None:
-                continue
-            columns = content.end[1] + 1 - content.start[1]
-            if columns > MAX_COLUMNS:
-                problem = f"expected at most {MAX_COLUMNS} columns, got {columns:,}"
-                raise InputError(f"{path}: sheet {sheet.name!r}", problem, "Remove columns that are not needed.")
-            rows = enumerate(content.iter_rows(), start=content.start[0] + 1)
-            error_cells = _error_cells(path, sheet.name)
-            for number, cells in rows:
-                texts = [_cell_text(cell) for cell in cells]
-                for column, error in error_cells.get(number, {}).items():
-                    texts[column - content.start[1]] = error
-                if any(texts):
-                    yield Block({"sheet": sheet.name, "row": number}, json.dumps(texts).encode())
-
-    serve(read)
-
-
-def _is_archive_of_other_files(path: Path) -> bool:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return not {"[Content_Types].xml", "content.xml"} & set(archive.namelist())
-    except zipfile.BadZipFile:
-        return False
-
-
-def _error_cells(path: Path, sheet: str) -> dict[int, dict[int, str]]:
-    """Return the errors of formulas in a sheet of an xlsx file, such as ``#DIV/0!``; calamine returns empty cells.
-
-    They are by row (from 1) and column (from 0).
-    """
-    from defusedxml.ElementTree import iterparse
-
-    errors: dict[int, dict[int, str]] = {}
-    if not zipfile.is_zipfile(path):
-        return errors
-    with zipfile.ZipFile(path) as archive:
-        if (member := _sheet_member(archive, sheet)) not in archive.namelist():
-            return errors
-        with archive.open(member) as content:
-            for _, element in iterparse(content, ("end",)):
-                position = _CELL_POSITION.fullmatch(element.get("r", ""))
-                if element.tag.endswith("}c") and element.get("t") == "e" and position is not None:
-                    column = functools.reduce(lambda number, letter: 26 * number + ord(letter) - 64, position[1], 0) - 1
-                    errors.setdefault(int(position[2]), {})[column] = "".join(element.itertext())
-                if element.tag.endswith("}row"):
-                    element.clear()
-    return errors
-
-
-def _sheet_member(archive: zipfile.ZipFile, sheet: str) -> str:
-    """Return the name of the file in an xlsx file that has a sheet; an empty text where there is none."""
-    from defusedxml.ElementTree import parse
-
-    try:
-        with archive.open("xl/workbook.xml") as workbook, archive.open("xl/_rels/workbook.xml.rels") as links:
-            sheets = {entry.get("name"): entry for entry in parse(workbook).iter() if entry.tag.endswith("}sheet")}
-            targets = {link.get("Id"): link.get("Target", "") for link in parse(links).iter()}
-    except KeyError:
-        return ""
-    target = next((targets[value] for value in sheets[sheet].attrib.values() if value in targets), "")
-    return target.removeprefix("/") if target.startswith("/") else f"xl/{target}"
-
-
-def _cell_text(value: object) -> str:
-    """Return a cell as it would be written in CSV."""
-    match value:
-        case bool():
-            return str(value).lower()
-        case float() if value.is_integer() and abs(value) < 1e15:
-            return str(int(value))
-        case datetime.timedelta():
-            minutes, seconds = divmod(round(value.total_seconds()), 60)
-            return _clock_text(minutes // 60, minutes % 60, seconds)
-        case datetime.datetime() | datetime.date():
-            return value.isoformat()
-        case datetime.time():
-            return _clock_text(value.hour, value.minute, value.second)
-    return str(value)
-
-
-def _clock_text(hours: int, minutes: int, seconds: int) -> str:
-    return f"{hours:02d}:{minutes:02d}" + (f":{seconds:02d}" if seconds else "")
-
-
-if __name__ == "__main__":
-    _serve_workbook()
