@@ -81,7 +81,7 @@ def _position(scenario: NewScenario) -> str:
 
 
 def describe_streets(streets: Streets) -> str:
-    signalised = sum(junction.signalised for junction in streets.junctions)
+    signalised = sum(junction.signalised for junction in junctions.distinct_crossings(streets))
     length = f"{streets.lane_length_m / 1000:,.1f} km of lanes"
     return (
         f"{number_of(len(streets.network.edges), 'edge')}, {length}, {number_of(signalised, 'junction')} with signals"

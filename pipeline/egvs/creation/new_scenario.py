@@ -748,7 +748,7 @@ def _choose_junction(
 
 def _describe_others(streets: Streets) -> tuple[str, ...]:
     """Return the junctions that follow the largest one, each with the option that chooses it."""
-    largest = [junction for junction in junctions.largest_junctions(streets) if junction.is_crossing]
+    largest = junctions.distinct_crossings(streets)
     return tuple(f"{junction.title} (--at {_at_option(streets, junction.at_m)})" for junction in largest[1:])
 
 
@@ -864,23 +864,17 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
     if not junction_fits:
         notes.append(f"The junction is larger than the region of interest (at most {junctions.ROI_MAX_M:g} m).")
     heights = counts.heights.get("building", Counter())
-    if heights["default"]:
+    origins = {
+        "default": f"{DEFAULT_BUILDING_M:g} m assumed",
+        NEIGHBOURS: "the median height of the buildings near by assumed",
+        SURFACE_MODEL: "the surface model's height above the terrain",
+    }
+    used = [f"{origin} for {heights[key]}" for key, origin in origins.items() if heights[key]]
+    if used:
+        number = sum(heights[key] for key in origins)
         notes.append(
-            f"{heights['default']} of {number_of(heights.total(), 'building')}"
-            f" {by_number(heights['default'], 'has', 'have')} neither height nor levels:"
-            f" {DEFAULT_BUILDING_M:g} m assumed."
-        )
-    if heights[NEIGHBOURS]:
-        notes.append(
-            f"{heights[NEIGHBOURS]} of {number_of(heights.total(), 'building')}"
-            f" {by_number(heights[NEIGHBOURS], 'has', 'have')} neither height nor levels: the median height of"
-            " the buildings near by assumed."
-        )
-    if heights[SURFACE_MODEL]:
-        notes.append(
-            f"{heights[SURFACE_MODEL]} of {number_of(heights.total(), 'building')}"
-            f" {by_number(heights[SURFACE_MODEL], 'has', 'have')} neither height nor levels: their heights are"
-            " those of the surface model above the terrain."
+            f"{number} of {number_of(heights.total(), 'building')} {by_number(number, 'has', 'have')} neither height nor"
+            f" levels: {', '.join(used)}."
         )
     return notes
 
