@@ -867,15 +867,14 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
     origins = {
         "default": f"{DEFAULT_BUILDING_M:g} m assumed",
         NEIGHBOURS: "the median height of the buildings near by assumed",
-        SURFACE_MODEL: "the surface model's height above the terrain",
+        SURFACE_MODEL: "the surface model above the terrain used",
     }
-    used = [f"{origin} for {heights[key]}" for key, origin in origins.items() if heights[key]]
+    used = {origin: heights[key] for key, origin in origins.items() if heights[key]}
     if used:
-        number = sum(heights[key] for key in origins)
-        notes.append(
-            f"{number} of {number_of(heights.total(), 'building')} {by_number(number, 'has', 'have')} neither height nor"
-            f" levels: {', '.join(used)}."
-        )
+        number, total = sum(used.values()), number_of(heights.total(), "building")
+        sources = [f"{origin} for {count}" if len(used) > 1 else origin for origin, count in used.items()]
+        have = by_number(number, "has", "have")
+        notes.append(f"{number} of {total} {have} neither height nor levels: {', '.join(sources)}.")
     return notes
 
 
