@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from shapely.geometry import LineString, MultiLineString, Point
 
+from egvs.cli.new_summary import describe_streets
 from egvs.core.errors import InputError
 from egvs.creation import assumed_traffic
 from egvs.creation.new_scenario import NewScenario
@@ -163,6 +164,22 @@ def test_next_junctions_are_listed_with_the_option_that_chooses_them(tmp_path: P
     again = create_scenario(tmp_path / "other", tmp_path / "map.osm", (lat_deg, lon_deg))
     assert again.junction.title == PLAIN
     assert not again.region.other_junctions
+
+
+def test_second_carriageway_is_no_further_junction(tmp_path: Path) -> None:
+    """B Street meets both carriageways of A Street, 30 m apart; there are signals at both, and at a stop line."""
+    nodes = {1: (-300.0, 0.0), 2: (0.0, 0.0), 3: (300.0, 0.0), 4: (300.0, 30.0), 5: (0.0, 30.0), 6: (-300.0, 30.0)}
+    nodes |= {7: (0.0, -200.0), 8: (0.0, 200.0), 9: (-60.0, 0.0)}
+    ways = [
+        street("A Street", 1, 9, 2, 3, oneway="yes"),
+        street("A Street", 4, 5, 6, oneway="yes"),
+        street("B Street", 7, 2, 5, 8),
+    ]
+    signals = {node: {"highway": "traffic_signals"} for node in (2, 5, 9)}
+    summary = create_scenario(tmp_path / "out", write_map(tmp_path / "map.osm", nodes, ways, signals), None)
+    assert summary.junction.title == SIGNALISED
+    assert not summary.region.other_junctions
+    assert describe_streets(summary.streets).endswith(", 1 junction with signals")
 
 
 @pytest.mark.parametrize("access", [True, False])
