@@ -844,7 +844,7 @@ def _range_notes(counts: ImportCounts) -> list[str]:
         return []
     total = left_out + counts.objects.total() - counts.objects["tree_crown"]
     range_m = CATALOGUE[SENSOR].range_m
-    reason = f"they are beyond the range of a {SENSOR} ({range_m:g} m) from the region of interest and change no score."
+    reason = f"more than {range_m:g} m (the range of a {SENSOR}) from the region of interest."
     return [
         f"{left_out:,} of {number_of(total, 'static object')} {by_number(left_out, 'is', 'are')} left out: {reason}"
     ]

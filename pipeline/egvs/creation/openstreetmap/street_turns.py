@@ -601,8 +601,8 @@ def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
     if count := len(after.turns_back):
         turns = list_turns(graph.title(pair) for pair in after.turns_back)
         yield (
-            f"{number_of(count, 'U-turn')} (more than {U_TURN_DEG:g} degrees) {by_number(count, 'is', 'are')} left out,"
-            f" since vehicles that wait to turn back block a street: {turns}."
+            f"{number_of(count, 'U-turn')} {by_number(count, 'is', 'are')} left out, since vehicles that wait to turn"
+            f" back block a street: {turns}."
         )
     if count := len(after.off_arrows):
         turns = list_turns(graph.title((lane.source, lane.target)) for lane in after.off_arrows)
