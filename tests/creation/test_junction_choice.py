@@ -141,6 +141,17 @@ def test_carriageways_of_divided_roads_are_one_arm_each(tmp_path: Path) -> None:
     assert (summary.junction.arms, summary.junction.lanes_in) == (4, 4)
 
 
+def test_lane_for_turning_belongs_to_the_arm_of_its_road(tmp_path: Path) -> None:
+    """Main Street has a lane of its own for right turns, from 90 m before the junction on."""
+    nodes = {1: (-300.0, 0.0), 2: (-90.0, 0.0), 3: (-60.0, -6.0), 4: (-20.0, -6.0), 5: (0.0, 0.0), 6: (300.0, 0.0)}
+    nodes |= {7: (0.0, -200.0)}
+    turning = street("", 2, 3, 4, 5, oneway="yes")
+    ways = [street("Main Street", 1, 2, 5, 6), turning, street("Side Street", 5, 7)]
+    osm = write_map(tmp_path / "map.osm", nodes, ways, {5: {"highway": "traffic_signals"}})
+    summary = create_scenario(tmp_path / "out", osm, None)
+    assert (summary.junction.arms, summary.junction.lanes_in) == (3, 4)
+
+
 def test_road_that_becomes_divided_is_no_junction(tmp_path: Path) -> None:
     nodes = {1: (-300.0, 0.0), 2: (0.0, 0.0), 3: (30.0, 6.0), 4: (300.0, 6.0), 5: (30.0, -6.0), 6: (300.0, -6.0)}
     nodes |= {7: (-200.0, 0.0), 8: (-200.0, 150.0)}
