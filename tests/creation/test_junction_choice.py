@@ -142,11 +142,11 @@ def test_carriageways_of_divided_roads_are_one_arm_each(tmp_path: Path) -> None:
 
 
 def test_lane_for_turning_belongs_to_the_arm_of_its_road(tmp_path: Path) -> None:
-    """Main Street has a lane of its own for right turns, from 90 m before the junction on."""
+    """Main Street has a lane of its own for right turns, from 90 m before the junction on; Lane meets it beside it."""
     nodes = {1: (-300.0, 0.0), 2: (-90.0, 0.0), 3: (-60.0, -6.0), 4: (-20.0, -6.0), 5: (0.0, 0.0), 6: (300.0, 0.0)}
-    nodes |= {7: (0.0, -200.0)}
+    nodes |= {7: (0.0, -200.0), 8: (-50.0, 0.0), 9: (-50.0, 200.0)}
     turning = street("", 2, 3, 4, 5, oneway="yes")
-    ways = [street("Main Street", 1, 2, 5, 6), turning, street("Side Street", 5, 7)]
+    ways = [street("Main Street", 1, 2, 8, 5, 6), turning, street("Side Street", 5, 7), street("Lane", 8, 9)]
     osm = write_map(tmp_path / "map.osm", nodes, ways, {5: {"highway": "traffic_signals"}})
     summary = create_scenario(tmp_path / "out", osm, None)
     assert (summary.junction.arms, summary.junction.lanes_in) == (3, 4)
