@@ -115,7 +115,7 @@ class StreetNetwork(NamedTuple):
     streets
         The same network, read.
     notes
-        Sentences for the user about its turns.
+        Sentences for the user about its turns, and what the map does not state.
     """
 
     text: str
@@ -460,7 +460,8 @@ def _write_streets(extract: OsmExtract, xml: Path) -> None:
             writer.add_node(mutable.Node(id=node, location=(lon_deg, lat_deg), tags=tags))
         for way in streets:
             nodes = [n for n in way.nodes if n in extract.nodes]
-            writer.add_way(mutable.Way(id=way.id, nodes=nodes, tags=sorted(way.tags.items())))
+            name = {"name": way.tags["ref"]} if "ref" in way.tags else {}  # the only name of many main roads
+            writer.add_way(mutable.Way(id=way.id, nodes=nodes, tags=sorted((name | way.tags).items())))
         for relation in extract.relations:
             if is_restriction(relation):
                 members = [(member.type[0], member.id, member.role) for member in relation.members]
