@@ -262,8 +262,8 @@ def test_alignment_turns_and_moves() -> None:
     ("pairs", "problem"),
     [
         ([((0, 0), (1, 1))], "expected two points"),
-        ([((0, 0), (0, 0)), ((10, 0), (11, 0))], "10.00 m apart in the file and 11.00 m on the ground"),
-        ([((0, 0), (0, 0)), ((0, 0), (0, 0))], "0.00 m apart"),
+        ([((0, 0), (0, 0)), ((10, 0), (11, 0))], "10.00 apart in the file and 11.00 m on the ground"),
+        ([((0, 0), (0, 0)), ((0, 0), (0, 0))], "0.00 apart"),
     ],
 )
 def test_rejects_alignment(pairs: list[alignment.PointPair], problem: str) -> None:
