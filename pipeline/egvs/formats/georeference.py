@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -77,7 +78,7 @@ class WorldFrame:
         if crs.is_projected:
             problem = f"has axes in {units[0]} to the {' and '.join(directions)}"
         hint = "Use a projection in metres to the east and north, for example epsg = 32632 (UTM zone 32 north)."
-        raise InputError(where, f"{projection} ({crs.name}) {problem}", hint)
+        raise InputError(where, f"{_shorten(projection)} ({crs.name}) {problem}", hint)
 
     def from_lon_lat(self, lon_lat_deg: FloatArray) -> FloatArray:
         """Convert longitude and latitude (n, 2) in degrees to world-frame x, y in metres, (n, 2) float64.
@@ -177,7 +178,9 @@ def _parse_complete(crs: Any) -> CRS:
     from pyproj.exceptions import CRSError
 
     try:
-        return CRS.from_user_input(crs)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # +init=epsg:25832 is an old form of EPSG:25832
+            return CRS.from_user_input(crs)
     except (CRSError, TypeError, ValueError):
         raise InputError("", f"unknown coordinate reference system {_shorten(str(crs))!r}", _SYSTEM_HINT) from None
 
@@ -199,14 +202,13 @@ def _no_conversion_error(crs: CRS, error: Exception) -> InputError:
     if grids:
         problem += f": the grid {grids[0]} is not installed"
         return InputError("", problem, "Name the system by its EPSG code, or install the grid with projsync.")
-    reason = re.sub(r".*Internal Proj Error: (?:\w+: )*", "", str(error)).partition(". ")[0].removesuffix(")")
+    reason = re.sub(r".*Internal Proj Error: (?:\w+: )*", "", str(error)).partition(". ")[0]
+    reason = reason.removesuffix(")" if reason.count(")") > reason.count("(") else "")
     return InputError("", f"{problem} ({reason})", _SYSTEM_HINT)
 
 
 def proj_string(crs: str, where: str) -> str:
     """Return a coordinate reference system as a PROJ string, which is all that SUMO reads; InputError if unknown."""
-    import warnings
-
     parsed = parse_crs(crs, where)
     if crs.strip().startswith("+proj="):
         return _HEIGHT_WORDS.sub("", crs).strip()
