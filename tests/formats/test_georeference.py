@@ -363,6 +363,14 @@ def test_one_message_where_proj_cannot_convert(crs: str, message: str) -> None:
         parse_crs(crs, "a.csv: crs")
 
 
+def test_grid_that_the_datum_makes_needless_is_left_out() -> None:
+    """SUMO would reject the string."""
+    needless = "+proj=utm +zone=32 +datum=WGS84 +nadgrids=none_such.gsb +units=m"
+    assert proj_string(needless, "a") == "+proj=utm +zone=32 +datum=WGS84 +units=m"
+    mercator = "+proj=merc +a=6378137 +b=6378137 +units=m +nadgrids=@null"
+    assert proj_string(mercator, "a") == mercator
+
+
 def test_old_form_of_an_epsg_code_is_read_without_a_warning() -> None:
     assert parse_crs("+init=epsg:25832", "a").to_epsg() == 25832
 

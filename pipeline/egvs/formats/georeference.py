@@ -48,6 +48,7 @@ _SYSTEM_HINT = 'Use a name that PROJ knows, for example "EPSG:25832".'
 _MAX_SHOWN = 100
 _HEIGHT_WORDS = re.compile(r"\+(?:geoidgrids|geoid_crs|vunits|vto_meter)=[^\s\"']*\s*")
 """What a PROJ string says of heights, also inside WKT: PROJ cannot convert x and y where it lacks the named grid."""
+_GRID_WORDS = re.compile(r"\+nadgrids=[^\s\"']+\s*")
 
 
 @dataclass(frozen=True)
@@ -211,11 +212,26 @@ def proj_string(crs: str, where: str) -> str:
     """Return a coordinate reference system as a PROJ string, which is all that SUMO reads; InputError if unknown."""
     parsed = parse_crs(crs, where)
     if crs.strip().startswith("+proj="):
-        return _HEIGHT_WORDS.sub("", crs).strip()
+        text = _HEIGHT_WORDS.sub("", crs).strip()
+        return text if _has_grids(text) else _GRID_WORDS.sub("", text).strip()
     with warnings.catch_warnings():
         # a PROJ string cannot say everything, such as the names of axes
         warnings.simplefilter("ignore", UserWarning)
         return str(parsed.to_proj4())
+
+
+def _has_grids(proj_string: str) -> bool:
+    """Return whether PROJ has the grids that a string names; parse_crs rejects a system that needs those it lacks."""
+    from pyproj import Proj
+    from pyproj.exceptions import ProjError
+
+    if _GRID_WORDS.search(proj_string) is None:
+        return True
+    try:
+        Proj(proj_string)
+    except ProjError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)

@@ -519,6 +519,22 @@ def test_virtual_junction_is_named_and_moves_no_road(tmp_path: Path) -> None:
 
 
 @pytest.mark.system
+def test_turn_through_two_junctions_without_a_road_between_is_named(tmp_path: Path) -> None:
+    """Road 1 leads to road 2 by road 11 in junction 8 and road 21 in junction 9; netconvert sees no road between."""
+    one = section([lane(-1, link="predecessor -1, successor -1")])
+    road_map, _ = convert(tmp_path, maps.opendrive(
+        road("1", 100, geometry(0, 0, 0, 100), section([lane(-1)]), "successor junction 8"),
+        road("11", 20, geometry(100, 0, 0, 20), one, "predecessor road 1 end, successor junction 9", junction="8"),
+        road("21", 20, geometry(120, 0, 0, 20), one, "predecessor junction 8, successor road 2 start", junction="9"),
+        road("2", 100, geometry(140, 0, 0, 100), section([lane(-1)]), "predecessor junction 9"),
+        maps.junction("8", ("1", "11", "start", "-1:-1")), maps.junction("9", ("11", "21", "start", "-1:-1")),
+    ))  # fmt: skip
+    notes = " ".join(road_map.notes)
+    assert "of 1 turns of the map" in notes
+    assert ("0 of 1 turns" in notes) == ("Turns between these roads are missing: 1 to 2." in notes)
+
+
+@pytest.mark.system
 def test_limit_of_netconvert_says_nothing_against_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise sumo.program_error("netconvert", 1, "Error: std::bad_alloc", sumo.Allowance(300, 1))
