@@ -193,14 +193,17 @@ def test_second_carriageway_is_no_further_junction(tmp_path: Path) -> None:
     assert describe_streets(summary.streets).endswith(", 1 junction with signals")
 
 
-@pytest.mark.parametrize("access", [True, False])
-def test_network_with_at_most_one_end_has_traffic_through_the_junction(tmp_path: Path, access: bool) -> None:
+@pytest.mark.parametrize("access", ["road", "carriageways", "none"])
+def test_network_with_at_most_one_end_has_traffic_through_the_junction(tmp_path: Path, access: str) -> None:
     """A block of streets with a cross in its middle: 4 approaches with 3 turns each, with or without an access road."""
     nodes = {1: (0.0, 0.0), 2: (100.0, 0.0), 3: (-100.0, 0.0), 4: (0.0, 100.0), 5: (0.0, -100.0)}
     nodes |= {6: (100.0, 100.0), 7: (-100.0, 100.0), 8: (-100.0, -100.0), 9: (100.0, -100.0), 10: (250.0, 100.0)}
     ways = [street("East Street", 3, 1, 2), street("North Street", 4, 1, 5), street("Block", 6, 4, 7, 3, 8, 5, 9, 2, 6)]
-    if access:
+    if access == "road":
         ways.append(street("Access", 6, 10))
+    elif access == "carriageways":
+        nodes[11] = (250.0, 110.0)
+        ways += [street("Access", 6, 10, oneway="yes"), street("Access", 11, 6, oneway="yes")]
     osm = write_map(tmp_path / "map.osm", nodes, ways, {1: {"highway": "traffic_signals"}})
     summary = create_scenario(tmp_path / "out", osm, None)
     assert len(summary.flows) == 12

@@ -342,7 +342,7 @@ def test_network_that_sumo_rejects_is_named(tmp_path: Path, run_egvs) -> None:
     assert count
     network.write_text(text, encoding="utf-8")
     code, _, error = run_egvs("new", tmp_path / "made", "--from", network)
-    assert code == 2 and f"{network}: SUMO cannot simulate the network (" in error and "none_such" in error
+    assert code == 2 and f"{network}: SUMO cannot simulate the network: " in error and "none_such" in error
     assert not (tmp_path / "made").exists()
 
 

@@ -184,6 +184,32 @@ def test_restriction_whose_streets_do_not_meet_at_its_node_is_named(via: XY | No
     assert note.endswith(f"1 (relation {relation}).")
 
 
+def test_restriction_without_a_target_is_named() -> None:
+    draft, ways = divided_road()
+    relation = draft.restrict("no_left_turn", ways["middle"], draft.via((0.0, -APART_M)), ways["to east"])
+    draft.relations = [replace(draft.relations[0], members=draft.relations[0].members[:-1])]
+    (note,) = notes(build(draft.extract()))
+    assert note.startswith("Turn restrictions whose streets do not meet") and f"(relation {relation})" in note
+
+
+def test_only_permitted_way_may_be_no_street() -> None:
+    """All turns would be closed; the footway is drawn to the middle of the junction."""
+    draft, ways = divided_road()
+    path = draft.way((0.0, -APART_M), (30.0, -40.0), highway="footway")
+    relation = draft.restrict("only_left_turn", ways["from west"], draft.via((0.0, -APART_M)), path)
+    made = build(draft.extract())
+    assert any("whose only permitted street is not in the network" in n and str(relation) in n for n in notes(made))
+    assert (str(ways["from west"]), str(ways["to east"])) in edge_turns(made)
+
+
+def test_turn_that_is_forbidden_at_red_is_open() -> None:
+    """netconvert would close it."""
+    draft, ways = divided_road()
+    draft.restrict("no_right_turn_on_red", ways["from west"], draft.via((0.0, -APART_M)), ways["south"])
+    made = build(draft.extract())
+    assert (str(ways["from west"]), str(ways["south"])) in edge_turns(made)
+
+
 def test_restriction_over_street_between_junctions_is_named() -> None:
     """SUMO has no way to say that only those who come from one street may not turn."""
     draft = MapDraft()

@@ -585,9 +585,8 @@ def _choose_vehicles(draft: _Draft) -> ScenarioTraffic:
     try:
         return assumed_traffic.assume_traffic(draft.plan.network, streets, draft.junction, options.traffic)
     except SumoInputError as error:
-        lines = " ".join(line.strip() for line in str(error).splitlines()).rstrip(":.")
         hint = "Check the map, e.g. its traffic lights and connections in netedit."
-        raise InputError(draft.files.roads.path, f"SUMO cannot simulate the network ({lines})", hint) from None
+        raise error.for_input(draft.files.roads.path, "SUMO cannot simulate the network", hint) from None
 
 
 def _write_scenario(draft: _Draft) -> NewScenario:

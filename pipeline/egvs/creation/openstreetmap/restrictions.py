@@ -100,6 +100,9 @@ def read_restrictions(extract: OsmExtract) -> Restrictions:
     in_force: list[Restriction] = []
     conditional, by_vehicle, with_exceptions, without_turn = [], [], [], []
     for relation in map(_in_present_form, filter(is_restriction, extract.relations)):
+        if not (relation.ways("from") and relation.ways("to")):
+            without_turn.append(relation.id)
+            continue
         restriction = _parse(relation, extract)
         if restriction is None:
             continue
@@ -185,7 +188,8 @@ def _excepted(tags: Tags) -> set[str]:
 
 
 def _is_kind(value: str) -> bool:
-    return value.startswith(("no_", "only_"))
+    """Return whether a value forbids turns; ``no_right_turn_on_red`` forbids them at red only."""
+    return value.startswith(("no_", "only_")) and not value.endswith("_on_red")
 
 
 def restrictions_of_pieces(

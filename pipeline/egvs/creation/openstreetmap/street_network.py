@@ -175,8 +175,7 @@ def build_network(
             if _NOTHING_LOADED.search(str(error)):
                 raise no_streets from None
             if isinstance(error, sumo.SumoInputError):
-                problem = f"netconvert cannot use the streets: {error}"
-                raise InputError(osm, problem, "Choose another extract.") from None
+                raise error.for_input(osm, "netconvert cannot use the streets", "Choose another extract.") from None
             raise
         text = (folder / NETWORK_FILE).read_text(encoding="utf-8")
 

@@ -211,8 +211,9 @@ class StreetGraph:
         return not restriction.only or any(self._is_in_network(way) for way in restriction.targets)
 
     def _is_in_network(self, way: int) -> bool:
-        """Return whether a way is on edges, or inside a junction between them."""
-        return way in self._ways and bool(self._nodes & {*self._ways[way].nodes})
+        """Return whether a way for vehicles is on edges, or inside a junction between them."""
+        found = self._ways.get(way)
+        return found is not None and found.tags["highway"] in _FOR_VEHICLES and bool(self._nodes & {*found.nodes})
 
     def _add_edge(self, element: Element) -> None:
         edge_id = element.attrib["id"]
@@ -414,9 +415,10 @@ class StreetGraph:
         return f"{text} (relation {list_first([str(r) for r in sorted(relations)], 3)})" if relations else text
 
     def is_in_network(self, relation: int) -> bool:
-        """Return whether both ends of a restriction are streets of the network."""
+        """Return whether both ends of a restriction are streets of the network, or the one that it names."""
         members = next(r for r in self._extract.relations if r.id == relation)
-        return all(any(map(self._is_in_network, members.ways(role))) for role in ("from", "to"))
+        ends = [ways for ways in map(members.ways, ("from", "to")) if ways]
+        return bool(ends) and all(any(map(self._is_in_network, ways)) for ways in ends)
 
     def edges_without(self, keys: Collection[str]) -> Iterator[StreetEdge]:
         """Yield the edges of which a part has none of some tags."""

@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
@@ -326,6 +326,8 @@ class OpenDriveMap:
         By id.
     junctions
         The connections of each junction, by id.
+    virtual
+        Ids of virtual junctions, which join roads between their ends.
     """
 
     reference: str
@@ -333,6 +335,11 @@ class OpenDriveMap:
     offset_rad: float
     roads: Mapping[str, Road]
     junctions: Mapping[str, tuple[JunctionConnection, ...]]
+    virtual: frozenset[str] = frozenset()
+
+    def is_in_virtual_junction(self, road: str) -> bool:
+        """Return whether a road leads through a virtual junction."""
+        return road in self.roads and self.roads[road].junction in self.virtual
 
 
 def evaluate(cubics: Sequence[Cubic], s_m: FloatArray) -> FloatArray:
@@ -363,6 +370,7 @@ def read_opendrive(path: Path) -> OpenDriveMap:
     header: Element | None = None
     roads: dict[str, Road] = {}
     junctions: dict[str, tuple[JunctionConnection, ...]] = {}
+    virtual = set()
     for element in xml.iter_elements(path, "", on_root=lambda root: _check_root(root, path)):
         _strip_namespaces(element)
         name = f"<{element.tag} id={element.get('id', '')!r}>"
@@ -378,6 +386,8 @@ def read_opendrive(path: Path) -> OpenDriveMap:
                     limits.MAP_OBJECTS.check(path, len(roads), "has too many roads")
                 case "junction":
                     junctions[element.attrib["id"]] = tuple(_parse_connections(element))
+                    if element.get("type") == "virtual":
+                        virtual.add(element.attrib["id"])
         except KeyError as error:
             raise InputError(f"{path}: {name}", f"the attribute {error} is missing", _HINT) from None
         except ValueError as error:
@@ -388,7 +398,7 @@ def read_opendrive(path: Path) -> OpenDriveMap:
         reference, offset_m, offset_rad = _parse_header(header)
     except ValueError as error:
         raise InputError(f"{path}: <header>", str(error), _HINT) from None
-    return OpenDriveMap(reference, offset_m, offset_rad, roads, junctions)
+    return OpenDriveMap(reference, offset_m, offset_rad, roads, junctions, frozenset(virtual))
 
 
 def _check_root(root: Element, path: Path) -> None:
@@ -513,12 +523,42 @@ def _parse_sections(road: Element, length_m: float) -> Iterator[LaneSection]:
     elements = sorted(road.iterfind("lanes/laneSection"), key=lambda element: _number(element, "s"))
     ends = [*(_number(element, "s") for element in elements[1:]), length_m]
     for element, end_m in zip(elements, ends, strict=True):
+        widths_from_borders(element)
         lanes = [_parse_lane(lane) for side in ("left", "right") for lane in element.iterfind(f"{side}/lane")]
         if any(_integer(lane, "id") for lane in element.iterfind("center/lane")):
             raise ValueError("<center>: expected a lane with the id 0")
         by_id = {lane.id: lane for lane in sorted(lanes, key=lambda lane: lane.id)}
         start_m = _number(element, "s")
         yield LaneSection(start_m, max(start_m, end_m), by_id)
+
+
+def widths_from_borders(section: Element) -> None:
+    """Give widths to the lanes of a ``<laneSection>`` that have borders instead: the distance from the lane before.
+
+    Borders to the right are negative; those of programs that write distances instead are not.
+    """
+    for side, sign in (("left", 1), ("right", -1)):
+        inner: tuple[Cubic, ...] = ()
+        for lane in sorted(section.iterfind(f"{side}/lane"), key=lambda lane: abs(_integer(lane, "id"))):
+            borders = _parse_cubics(lane.iterfind("border"), "sOffset")
+            if borders and lane.find("width") is None:
+                for start_m in sorted({cubic.start_m for cubic in (*borders, *inner)}):
+                    outer, before = _moved(borders, start_m), _moved(inner, start_m)
+                    outwards = sign if sign * (outer[0] - before[0]) >= 0 else -sign
+                    values = [repr(outwards * (last - first)) for last, first in zip(outer, before, strict=True)]
+                    SubElement(lane, "width", {"sOffset": repr(start_m)} | dict(zip("abcd", values, strict=True)))
+            for border in lane.findall("border"):
+                lane.remove(border)
+            inner = borders
+
+
+def _moved(cubics: Sequence[Cubic], start_m: float) -> tuple[float, float, float, float]:
+    """Return the coefficients of piecewise polynomials from another start on; 0 without polynomials."""
+    if not cubics:
+        return 0.0, 0.0, 0.0, 0.0
+    cubic = next((cubic for cubic in reversed(cubics) if cubic.start_m <= start_m), cubics[0])
+    by_m, (_, a, b, c, d) = start_m - cubic.start_m, cubic
+    return a + by_m * (b + by_m * (c + by_m * d)), b + by_m * (2 * c + by_m * 3 * d), c + 3 * d * by_m, d
 
 
 def _parse_lane(element: Element) -> RoadLane:

@@ -172,8 +172,8 @@ class NetworkBuilder:
         try:
             return plain.build(flags)
         except sumo.SumoInputError as error:
-            problem = f"netconvert cannot build a network of its lanelets: {error}"
-            raise InputError(self._where, problem, _EDITOR_HINT) from None
+            problem = "netconvert cannot build a network of its lanelets"
+            raise error.for_input(self._where, problem, _EDITOR_HINT) from None
 
     def _node(self, node: str, attempt: int) -> PlainElement:
         x, y, z = self._shapes.position_m(node).tolist()
