@@ -372,10 +372,10 @@ def _map_notes(road_map: OpenDriveMap) -> tuple[str, ...]:
         )
     if road_map.virtual:
         count = len(road_map.virtual)
-        roads = [road for road in road_map.roads if road_map.is_in_virtual_junction(road)]
+        passing = [road for road in road_map.roads if road_map.is_in_virtual_junction(road)]
         notes.append(
             f"{number_of(count, 'virtual junction')}, which {by_number(count, 'joins', 'join')} roads between their"
-            f" ends, and the roads through {by_number(count, 'it', 'them')} are left out: {_listed(roads) or 'none'}."
+            f" ends, and the roads through {by_number(count, 'it', 'them')} are left out: {_listed(passing) or 'none'}."
         )
     sloped = [road.id for road in road_map.roads.values() if any(any(cubic[1:]) for cubic in road.superelevations)]
     if sloped:
