@@ -11,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core import limits
 from egvs.core.errors import InputError
-from egvs.core.polygons import check_crossings, check_edge_pairs, repair_polygon
+from egvs.core.polygons import PairCount, check_crossings, check_edge_pairs, repair_polygon
 
 
 def random_ring(corners: int, digits: int = 6, seed: int = 1) -> shapely.Polygon:
@@ -44,11 +44,12 @@ SHAPES = {
     "star": star(21),
     "comb with a knot": comb(30, *KNOT),
     "bow ties": chain_of_bow_ties(40),
-    "houses side by side": houses(3, 4),
     "ring that runs twice": shapely.Polygon([(0, 0), (9, 0), (9, 9), (0, 9)] * 2),
     "touches itself": shapely.Polygon([(0, 0), (4, 0), (4, 4), (2, 0), (0, 4)]),
     "hole outside": shapely.Polygon([(0, 0), (4, 0), (4, 4), (0, 4)], [[(3, 3), (6, 3), (6, 6), (3, 6)]]),
-    "nested": shapely.MultiPolygon([shapely.box(-i, -i, i, i) for i in range(1, 6)]),
+    "nested holes": shapely.Polygon(
+        shapely.box(-9, -9, 9, 9).exterior, [shapely.box(-i, -i, i, i).exterior for i in range(1, 6)]
+    ),
     **{f"random {n}.{digits}": random_ring(n, digits, n) for n in (4, 5, 7, 12, 30) for digits in (1, 2, 6)},
 }
 
@@ -95,17 +96,50 @@ def test_rejects_what_takes_long(check) -> None:
         check()
 
 
-def test_rejects_many_nested_rings(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(limits.HOLES.name, "50")
-    nested = shapely.MultiPolygon([shapely.box(-i, -i, i, i) for i in range(1, 60)])
-    with pytest.raises(InputError, match=r"^a: has rings .* inside each other\. The limit is 50 .*EGVS_MAX_HOLES"):
-        repair_polygon(nested, "a")
+@pytest.mark.parametrize(
+    ("work", "what"),
+    [
+        (lambda count: repair_polygon(random_ring(60), "a", count), "side by side"),
+        (lambda count: repair_polygon(shapely.MultiPolygon([random_ring(60)] * 3), "a", count), "side by side"),
+        (lambda count: check_edge_pairs(shapely.MultiPoint(np.zeros((60, 2))), "a", 1.0, count), "side by side"),
+        (lambda count: check_crossings(lines_of(random_ring(60)), "a", count), "that cross"),
+    ],
+    ids=["rings", "parts", "points", "crossings"],
+)
+def test_pairs_of_one_file_are_added_up(monkeypatch: pytest.MonkeyPatch, work, what: str) -> None:
+    monkeypatch.setenv(limits.EDGE_PAIRS.name, "9000")
+    count = PairCount("a.json")
+    work(count)
+    message = rf"^a: has, with those before it in the file, more than 9,000 pairs of edges {what}\. The limit"
+    with pytest.raises(InputError, match=message):
+        for _ in range(100):
+            work(count)
+
+
+def test_dense_lines_and_small_bad_rings_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(limits.EDGE_PAIRS.name, "10")
+    count = PairCount()
+    for _ in range(100):
+        repair_polygon(SHAPES["bow tie"], "a", count)
+        repair_polygon(SHAPES["bow ties"], "a", count)
+        check_edge_pairs(shapely.LineString([(i * 0.5, 0.0) for i in range(100)]), "a", 1.0, count)
+    assert not count.pairs.total()
+
+
+def test_parts_are_repaired_one_by_one() -> None:
+    """Houses that share walls all remain, and so does what two parts have in common."""
+    assert repair_polygon(houses(20, 20), "a").equals(shapely.box(0, 0, 20, 20))
+    overlapping = shapely.MultiPolygon([shapely.box(0, 0, 4, 4), shapely.box(2, 2, 6, 6)])
+    assert repair_polygon(overlapping, "a").area == 16 + 16 - 4
+    bow_tie = shapely.transform(SHAPES["bow tie"], lambda xy: xy + 10)
+    mixed = shapely.MultiPolygon([*overlapping.geoms, bow_tie, shapely.Polygon([(0, 0), (1, 1), (2, 2)])])
+    assert repair_polygon(mixed, "a").area == 28 + 2
 
 
 def test_accepts_long_valid_shapes() -> None:
     check_crossings([houses(40, 40)], "tiles")
     check_edge_pairs(shapely.LineString([(i * 0.01, math.sin(i * 0.001)) for i in range(50_000)]), "dense lane", 1.6)
-    assert repair_polygon(comb(10_000), "comb").is_valid
+    assert repair_polygon(comb(800), "comb").is_valid
 
 
 @pytest.mark.parametrize("name", ["lanes", "outlines"])

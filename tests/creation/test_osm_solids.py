@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 from shapely.geometry import Point
 
+from egvs.core.errors import InputError
+from egvs.core.polygons import PairCount
 from egvs.creation.map_parts import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap.solids import find_buildings
@@ -19,7 +21,7 @@ def imported(*ways: Tags) -> tuple[list[MappedSolid], ImportCounts]:
     nodes = {node: (0.0, 0.0) for node in XY}
     counts = ImportCounts()
     extract = OsmExtract(nodes, {}, squares, (), Bounds(0, 0, 1, 1), False)
-    return list(find_buildings(extract, XY, counts)), counts
+    return list(find_buildings(extract, XY, counts, PairCount())), counts
 
 
 @pytest.mark.parametrize(
@@ -106,9 +108,9 @@ def test_counts_building_without_outline() -> None:
     counts = ImportCounts()
     points = {1: {"building": "yes"}, 2: {"man_made": "tower"}, 3: {"shop": "bakery"}, 4: {"building": "no"}}
     extract = OsmExtract({node: (0.0, 0.0) for node in XY}, points, {}, (), Bounds(0, 0, 1, 1), False)
-    assert not list(find_buildings(extract, XY, counts))
+    assert not list(find_buildings(extract, XY, counts, PairCount()))
     assert counts.dropped == {"no_outline": {"building": 2}}
-    assert not list(find_buildings(extract, XY, counts, Point(900, 900)))
+    assert not list(find_buildings(extract, XY, counts, PairCount(), Point(900, 900)))
     assert counts.dropped == {"no_outline": {"building": 2}}, "out of reach"
 
 
@@ -120,7 +122,15 @@ def test_object_on_wall_starts_above_it() -> None:
         dict.fromkeys(XY, (0.0, 0.0)), {1: lamp}, {7: Way(7, (1, 2), tags)}, (), Bounds(0, 0, 1, 1), False
     )
     made = [
-        *osm_solids.find_barriers(extract, XY, ImportCounts()),
+        *osm_solids.find_barriers(extract, XY, ImportCounts(), PairCount()),
         *osm_solids.find_poles(extract, XY, ImportCounts()),
     ]
     assert [(solid.kind, solid.base_m, solid.height_m) for solid in made] == [("barrier", 1.2, 2.5), ("pole", 3.0, 8.0)]
+
+
+def test_messages_name_the_file_and_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("EGVS_MAX_CORNERS", "3")
+    square = {5: Way(5, (1, 2, 3, 4, 1), {"building": "yes"})}
+    extract = OsmExtract(dict.fromkeys(XY, (0.0, 0.0)), {}, square, (), Bounds(0, 0, 1, 1), False)
+    with pytest.raises(InputError, match=r"^town\.osm: way 5: has 4 corners\. The limit is 3 corners"):
+        list(find_buildings(extract, XY, ImportCounts(), PairCount("town.osm")))

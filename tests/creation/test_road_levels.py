@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from shapely.geometry import LineString
 
+from egvs.core.polygons import PairCount
 from egvs.creation import junctions, road_levels
 from egvs.creation.map_parts import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap import solids, street_network
@@ -150,7 +151,7 @@ def test_width_of_deck(tags: dict[str, str], width_m: float) -> None:
 def make_decks(tags: dict[str, str]) -> list[MappedSolid]:
     """Return the deck of a bridge 50 m long."""
     way = osm.Way(1, (1, 2), {"bridge": "yes", **tags})
-    return list(solids.make_decks([way], {1: (0.0, 0.0), 2: (50.0, 0.0)}, ImportCounts()))
+    return list(solids.make_decks([way], {1: (0.0, 0.0), 2: (50.0, 0.0)}, ImportCounts(), PairCount()))
 
 
 @pytest.mark.parametrize(

@@ -216,7 +216,7 @@ TRIALS = {
     "scenario.toml": Trial("scenario.toml", text("seed = 1\n"), reading.read_toml, {"EGVS_MAX_DOCUMENT_MB": 1}),
     "JSON, GeoJSON": Trial("a.geojson", text('{"a": 1}'), reading.read_json, {"EGVS_MAX_DOCUMENT_MB": 1}),
     "polygons of any format": Trial(
-        "a.geojson", text(polygon(3)), read_polygon, {"EGVS_MAX_HOLES": 2, "EGVS_MAX_CORNERS": 3}
+        "a.geojson", text(polygon(3)), read_polygon, {"EGVS_MAX_CORNERS": 3}
     ),
     "tables in CSV": Trial(
         "a.csv", text("a,b\n1,2\n"), read_table, {"EGVS_MAX_DOCUMENT_MB": 1},

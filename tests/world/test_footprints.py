@@ -192,18 +192,25 @@ def test_number_of_edges_side_by_side_has_a_limit(kind):
         to_polygons(geometry, {"radius_m": 20}, "star", Counter(), keep_crossing_parts=True)
 
 
-def test_number_of_holes_has_a_limit(tmp_path, monkeypatch):
-    """The time to triangulate a polygon grows with the square of its holes: 200,000 would take hours."""
+def test_number_of_corners_has_a_limit(tmp_path, monkeypatch):
+    """The time to triangulate a polygon can grow with the cube of its holes: 200,000 would take hours."""
     holes = [[[x, 1], [x, 2], [x + 0.5, 2], [x + 0.5, 1], [x, 1]] for x in range(1, 10)]
     walls = polygon([[0, 0], [20, 0], [20, 20], [0, 20], [0, 0]], *holes, height_m=3)
-    monkeypatch.setenv("EGVS_MAX_HOLES", "8")
-    with pytest.raises(DiagnosticsError, match=r"has 9 holes\. The limit is 8 holes; set EGVS_MAX_HOLES to raise it"):
-        build(tmp_path, walls)
-    monkeypatch.setenv("EGVS_MAX_HOLES", "9")
+    monkeypatch.setenv("EGVS_MAX_CORNERS", "40")
     world, _ = build(tmp_path, walls)
     assert volumes(world) == pytest.approx([3 * (400 - 9 * 0.5)])
-    monkeypatch.setenv("EGVS_MAX_CORNERS", "3")
-    with pytest.raises(
-        DiagnosticsError, match=r"has 4 corners\. The limit is 3 corners; set EGVS_MAX_CORNERS to raise"
-    ):
+    monkeypatch.setenv("EGVS_MAX_CORNERS", "39")
+    message = r"has 40 corners\. The limit is 39 corners; set EGVS_MAX_CORNERS to raise it"
+    with pytest.raises(DiagnosticsError, match=message):
         build(tmp_path, walls)
+
+
+def test_pairs_of_edges_add_up_over_a_file(tmp_path, monkeypatch):
+    """One wall that runs to and fro is built; of ten, those that are too many are rejected."""
+    zigzag = {"type": "LineString", "coordinates": [[0.01 * x, 10 * (x % 2)] for x in range(40)]}
+    wall = feature(zigzag, height_m=1, radius_m=0.25)
+    monkeypatch.setenv("EGVS_MAX_EDGE_PAIRS", "5000")
+    build(tmp_path, wall)
+    message = r"feature 4 .* has, with those before it in the file, more than 5,000 pairs of edges side by side"
+    with pytest.raises(DiagnosticsError, match=message):
+        build(tmp_path, *[wall] * 10)

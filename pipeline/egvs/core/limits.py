@@ -82,12 +82,14 @@ ELEMENT = Limit("EGVS_MAX_ELEMENT_MB", 16, "MB", "one element below the root of 
 XML_ELEMENTS = Limit("EGVS_MAX_XML_ELEMENTS", 10_000_000, "elements", "an XML file")
 POINTS = Limit("EGVS_MAX_POINTS", 30_000_000, "points", "a point cloud")
 TRIANGLES = Limit("EGVS_MAX_TRIANGLES", 5_000_000, "triangles", "a mesh")
-HOLES = Limit("EGVS_MAX_HOLES", 5000, "holes", "one polygon: the time to triangulate it grows with their square")
 CORNERS = Limit(
-    "EGVS_MAX_CORNERS", 10_000, "corners", "one ring of a polygon: the time to triangulate it grows with their square"
+    "EGVS_MAX_CORNERS", 3500, "corners", "one polygon with its holes: the time to cut it can grow with their cube"
 )
 EDGE_PAIRS = Limit(
-    "EGVS_MAX_EDGE_PAIRS", 100_000, "pairs of edges", "one geometry that crosses itself or is widened, side by side"
+    "EGVS_MAX_EDGE_PAIRS",
+    100_000,
+    "pairs of edges",
+    "the geometries of a file that cross themselves or are widened, side by side, beyond a few for each edge",
 )
 SITES = Limit("EGVS_MAX_SITES", 100_000, "candidates", "a scenario's sites")
 BEAMS = Limit("EGVS_MAX_BEAMS", 3_000_000, "beams", "one turn of a sensor")

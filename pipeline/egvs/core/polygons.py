@@ -6,18 +6,21 @@ corners, since it removes one layer of a crossing ring after another. Here the l
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, Literal
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core import limits
-from egvs.core.limits import Limit
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
+# pairs per edge that are not counted, since their time grows with the size of the file only
+_FREE_PAIRS, _FREE_WIDENED_PAIRS = 2, 5
 # edges or rings that are compared with all others at once: bounds the memory
 _BOXES_AT_ONCE = 64
 # pairs of boxes of edges that are looked at to find one crossing
@@ -27,11 +30,28 @@ _DETAIL = 0.01
 _POINTS_OF_PIECE = 200
 
 
-def repair_polygon(shape: BaseGeometry, where: object) -> BaseGeometry:
-    """Return the area that the rings of a shape enclose, by the even-odd rule.
+@dataclass
+class PairCount:
+    """Pairs of edges that were compared to repair, widen or join the geometries of one file.
 
-    A part of the plane belongs to it if an odd number of edges separates it from the outside; edges on top of each
-    other count as one. What has no area is left out. A valid shape is returned as it is.
+    Attributes
+    ----------
+    file
+        The file, for messages.
+    pairs
+        The pairs so far, by what they are of, and by the factor of their limit.
+    """
+
+    file: object = ""
+    pairs: Counter[tuple[str, float]] = field(default_factory=Counter)
+
+
+def repair_polygon(shape: BaseGeometry, where: object, count: PairCount | None = None) -> BaseGeometry:
+    """Return the area that the rings of a polygon enclose, by the even-odd rule, or all polygons of a shape together.
+
+    A part of the plane belongs to a polygon if an odd number of edges separates it from the outside; edges on top of
+    each other count as one. Polygons that overlap or share edges are joined. What has no area is left out. A valid
+    shape is returned as it is.
 
     Parameters
     ----------
@@ -39,22 +59,37 @@ def repair_polygon(shape: BaseGeometry, where: object) -> BaseGeometry:
         Polygons, with finite coordinates.
     where
         File and feature, for messages.
+    count
+        Pairs of edges of the same file so far, to which those of this shape are added.
 
     Raises
     ------
     InputError
-        When the repair would take long (:func:`check_edge_pairs`).
+        When the shape has too many corners, or the repair would take long (:func:`check_edge_pairs`).
     """
+    import shapely
+
+    check_corners(shape, where)
+    if shapely.is_valid(shape):
+        return shape
+    count = PairCount() if count is None else count
+    polygons = [_repair_rings(polygon, where, count) for polygon in shapely.get_parts(shape)]
+    if len(polygons) == 1:
+        return polygons[0]
+    check_crossings(polygons, where, count)
+    return shapely.union_all(polygons)
+
+
+def _repair_rings(polygon: BaseGeometry, where: object, count: PairCount) -> BaseGeometry:
+    """Return the area that the rings of one polygon enclose."""
     import shapely
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import dijkstra
 
-    if shapely.is_valid(shape):
-        return shape
-    check_edge_pairs(shape, where)
-    rings = shapely.get_rings(shapely.get_parts(shape))
-    _check_nesting(rings, where)
-    lines = shapely.union_all([shapely.LineString(ring) for ring in rings])
+    if shapely.is_valid(polygon):
+        return polygon
+    check_edge_pairs(polygon, where, count=count)
+    lines = shapely.union_all([shapely.LineString(ring) for ring in shapely.get_rings(polygon)])
     parts = shapely.get_parts(shapely.polygonize(shapely.get_parts(lines)))
     if len(parts) == 0:
         return shapely.MultiPolygon()
@@ -89,22 +124,26 @@ def _sides(parts: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return part_of_ring[ring[:-1][is_edge]][order], edge[order]
 
 
-def check_corners(shape: BaseGeometry, where: object) -> None:
-    """Raise an InputError when a polygon has many holes, or a ring of it many corners."""
+def check_corners(shape: BaseGeometry, where: object, factor: int = 1) -> None:
+    """Raise an InputError when a polygon, with its holes, or a line has more corners than the limit times a factor."""
     import shapely
 
-    polygons = shapely.get_parts(shapely.get_parts(shape))
-    limits.HOLES.check(where, shapely.get_num_interior_rings(polygons).max(initial=0))
-    areas = polygons[shapely.get_type_id(polygons) == shapely.GeometryType.POLYGON]
-    limits.CORNERS.check(where, (shapely.get_num_coordinates(shapely.get_rings(areas)) - 1).max(initial=0))
+    parts = shapely.get_parts(shapely.get_parts(shape))
+    is_polygon = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
+    # a ring repeats its first corner at its end
+    rings = np.where(is_polygon, shapely.get_num_interior_rings(parts) + 1, 0)
+    corners = (shapely.get_num_coordinates(parts) - rings).max(initial=0)
+    if corners > factor * limits.CORNERS.maximum:
+        limits.CORNERS.check(where, corners)
 
 
-def check_edge_pairs(shape: BaseGeometry, where: object, radius_m: float = 0.0) -> None:
-    """Raise an InputError when many edges of a shape are side by side.
+def check_edge_pairs(shape: BaseGeometry, where: object, radius_m: float = 0.0, count: PairCount | None = None) -> None:
+    """Raise an InputError when many edges of a shape, with those of the same file so far, are side by side.
 
     Memory and time to repair or to widen the shape grow with the number of their crossings, of which a few kilobytes of
     corners can have billions. Counted are pairs of edges (of points, if it has no edges) whose boxes, widened by
-    ``radius_m``, overlap; twice if they are widened, since an edge then has two sides.
+    ``radius_m``, overlap; twice if they are widened, since an edge then has two sides. A few pairs for each edge
+    are free.
     """
     import shapely
 
@@ -118,13 +157,11 @@ def check_edge_pairs(shape: BaseGeometry, where: object, radius_m: float = 0.0) 
     if "Point" not in shape.geom_type:
         is_edge = part[1:] == part[:-1]
         starts, ends = points[:-1][is_edge], points[1:][is_edge]
-    most = limits.EDGE_PAIRS.maximum // 2 if radius_m else limits.EDGE_PAIRS.maximum
-    if len(starts) ** 2 // 2 <= most:
-        return
     low = np.minimum(starts, ends) - radius_m
     high = np.maximum(starts, ends) + radius_m
-    actual = f"has more than {limits.EDGE_PAIRS.maximum:,} pairs of edges side by side"
-    _check_pairs(shapely.box(*low.T, *high.T), limits.EDGE_PAIRS, most, 1, where, actual)
+    boxes = shapely.box(*low.T, *high.T)
+    most, free = (0.5, _FREE_WIDENED_PAIRS) if radius_m else (1.0, _FREE_PAIRS)
+    _count_pairs(boxes, where, count, "pairs of edges side by side", most=most, free=free)
 
 
 def _without_details(lines: NDArray[Any], tolerance_m: float) -> NDArray[Any]:
@@ -141,49 +178,83 @@ def _without_details(lines: NDArray[Any], tolerance_m: float) -> NDArray[Any]:
     return simple
 
 
-def check_crossings(shapes: Iterable[BaseGeometry], where: object) -> None:
+def check_crossings(shapes: Iterable[BaseGeometry], where: object, count: PairCount | None = None) -> None:
     """Raise an InputError when so many edges of shapes cross that it would take long to join or subtract the shapes.
 
-    Edges that touch or overlap, as those of tiles do, do not count.
+    Edges that touch or overlap, as those of tiles do, do not count, and a few pairs for each edge are free.
     """
     import shapely
 
     lines = shapely.get_parts([shape.boundary if "Polygon" in shape.geom_type else shape for shape in shapes])
     points, line = shapely.get_coordinates(lines, return_index=True)
     is_edge = line[1:] == line[:-1]
-    edges = shapely.linestrings(np.stack([points[:-1][is_edge], points[1:][is_edge]], axis=1))
-    most = limits.EDGE_PAIRS.maximum
-    if len(edges) ** 2 // 2 <= most:
-        return
-    actual = f"has more than {most:,} pairs of edges that cross"
-    _check_pairs(edges, limits.EDGE_PAIRS, _BOXES_OF_CROSSING * most, 1, where, actual)
-    _check_pairs(edges, limits.EDGE_PAIRS, most, 1, where, actual, "crosses")
+    starts, ends = points[:-1][is_edge], points[1:][is_edge]
+    boxes = shapely.box(*np.minimum(starts, ends).T, *np.maximum(starts, ends).T)
+
+    def cross(one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return _are_separated(starts[one], ends[one], starts[other], ends[other]) & _are_separated(
+            starts[other], ends[other], starts[one], ends[one]
+        )
+
+    what = "pairs of edges that cross"
+    _count_pairs(boxes, where, count, what, most=_BOXES_OF_CROSSING)
+    _count_pairs(boxes, where, count, what, is_counted=cross)
 
 
-def _check_nesting(rings: NDArray[Any], where: object) -> None:
-    """Raise an InputError when many rings are inside others: each is compared with all of these."""
-    import shapely
+def _are_separated(
+    start: NDArray[np.float64], end: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return for each line (n, 2) from start to end whether two points (n, 2) are on different sides of it."""
+    direction = end - start
+    side_of_one = direction[:, 0] * (one - start)[:, 1] - direction[:, 1] * (one - start)[:, 0]
+    side_of_other = direction[:, 0] * (other - start)[:, 1] - direction[:, 1] * (other - start)[:, 0]
+    are_separated: NDArray[np.bool_] = np.sign(side_of_one) * np.sign(side_of_other) < 0
+    return are_separated
 
-    boxes = shapely.box(*shapely.bounds(rings).T)
-    count = limits.HOLES.maximum
-    actual = f"has rings that do not fit together, more than {count:,} of them inside each other"
-    _check_pairs(boxes, limits.HOLES, count**2 // 2, 0, where, actual)
 
-
-def _check_pairs(
-    shapes: NDArray[Any], limit: Limit, most: int, neighbours: int, where: object, actual: str,
-    predicate: Literal["crosses"] | None = None,
+def _count_pairs(
+    boxes: NDArray[Any], where: object, count: PairCount | None, what: str, *,
+    free: int = _FREE_PAIRS, most: float = 1.0,
+    is_counted: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]] | None = None,
 ) -> None:  # fmt: skip
-    """Raise an InputError when more than ``most`` pairs of boxes overlap, apart from those that follow each other.
+    """Add the pairs of boxes that overlap, apart from those that follow each other, to those of a file.
 
-    With a predicate, the shapes in the boxes are compared.
+    Parameters
+    ----------
+    boxes
+        Those of edges.
+    where, what
+        Feature, and what has the limit, for messages.
+    count
+        Pairs of the file so far.
+    free
+        How much per box is not counted.
+    most
+        Factor of the limit.
+    is_counted
+        Whether pairs count, given the numbers of both; all by default.
+
+    Raises
+    ------
+    InputError
+        When the pairs exceed the limit.
     """
     import shapely
 
-    tree = shapely.STRtree(shapes)
+    limit = limits.EDGE_PAIRS
+    uncounted = free * len(boxes)
+    if len(boxes) ** 2 // 2 <= uncounted:
+        return
+    count = PairCount() if count is None else count
+    before = count.pairs[what, most]
+    tree = shapely.STRtree(boxes)
     pairs = 0
-    for start in range(0, len(shapes), _BOXES_AT_ONCE):
-        one, other = tree.query(shapes[start : start + _BOXES_AT_ONCE], predicate=predicate)
-        pairs += int(np.count_nonzero(other > one + start + neighbours))
-        if pairs > most:
-            limit.check(where, limit.maximum + 1, actual)
+    for start in range(0, len(boxes), _BOXES_AT_ONCE):
+        one, other = tree.query(boxes[start : start + _BOXES_AT_ONCE])
+        one += start
+        one, other = one[other > one + 1], other[other > one + 1]
+        pairs += len(one) if is_counted is None else int(np.count_nonzero(is_counted(one, other)))
+        if before + max(pairs - uncounted, 0) > most * limit.maximum:
+            has = "has, with those before it in the file," if before else "has"
+            limit.check(where, limit.maximum + 1, f"{has} more than {limit.maximum:,} {what}")
+    count.pairs[what, most] = before + max(pairs - uncounted, 0)

@@ -120,6 +120,8 @@ class OsmExtract:
         The rectangle that the file declares, else that of its nodes.
     declared
         Whether the file declares its bounds.
+    path
+        The file, for messages.
     """
 
     nodes: dict[int, tuple[float, float]]
@@ -128,6 +130,7 @@ class OsmExtract:
     relations: tuple[Relation, ...]
     bounds: Bounds
     declared: bool
+    path: Path = Path("extract")
 
 
 def read_osm(path: Path) -> OsmExtract:
@@ -169,7 +172,7 @@ def read_osm(path: Path) -> OsmExtract:
     node_tags = dict(sorted(node_tags.items()))
     ways = dict(sorted(ways.items()))
     ordered = tuple(relations[number] for number in sorted(relations))
-    return OsmExtract(nodes, node_tags, ways, ordered, _bounds(box, nodes), box is not None)
+    return OsmExtract(nodes, node_tags, ways, ordered, _bounds(box, nodes), box is not None, path)
 
 
 def is_pbf(path: Path) -> bool:

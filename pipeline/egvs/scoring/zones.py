@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from egvs.core import limits
 from egvs.core.errors import Diagnostic, InputError, raise_together
+from egvs.core.polygons import PairCount, check_crossings
 from egvs.core.wording import format_percent, list_first
 from egvs.formats import spreadsheets
 from egvs.formats.georeference import Georeference
@@ -173,6 +174,9 @@ def _read_areas(path: Path, world: Georeference, *, need_names: bool = False) ->
     parts: dict[str, list[BaseGeometry]] = {}
     for name, polygon in footprints.read_named_polygons(path, world, need_names=need_names):
         parts.setdefault(name, []).append(polygon)
+    count = PairCount(path)
+    for name, polygons in parts.items():
+        check_crossings(polygons, f"{path}: zone {name}", count)
     return {name: shapely.union_all(polygons) for name, polygons in parts.items()}
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
-from egvs.core.polygons import check_edge_pairs
+from egvs.core.polygons import PairCount, check_corners, check_edge_pairs
 from egvs.formats import xml
 from egvs.scenario.fields import parse_coordinate_m
 from egvs.traffic.signal_clock import SignalClock
@@ -87,10 +87,14 @@ def is_carriageway(permission: Permission) -> bool:
 
 @dataclass(frozen=True)
 class Shape:
-    """A line or an outline, as text of the file ("x,y x,y,z ..."); ``where`` names it in messages."""
+    """A line or an outline, as text of the file ("x,y x,y,z ...").
+
+    ``where`` names it in messages; ``pairs`` are the pairs of edges of the file so far.
+    """
 
     text: str
     where: str
+    pairs: PairCount = field(default_factory=PairCount, compare=False, repr=False, kw_only=True)
 
     @cached_property
     def shape_m(self) -> NDArray[np.float64]:
@@ -110,7 +114,7 @@ class Shape:
 
         outline = shapely.Polygon(shape_m[:, :2])
         if not outline.is_valid:
-            check_edge_pairs(outline, self.where)
+            check_edge_pairs(outline, self.where, count=self.pairs)
 
     @property
     def has_heights(self) -> bool:
@@ -143,7 +147,7 @@ class Lane(Shape):
 
         super()._check_edges(shape_m)
         width_m = LANE_WIDTH_M if self.width_m is None else self.width_m
-        check_edge_pairs(shapely.LineString(shape_m[:, :2]), self.where, width_m / 2.0)
+        check_edge_pairs(shapely.LineString(shape_m[:, :2]), self.where, width_m / 2.0, self.pairs)
 
     def area(self, last_m: float | None = None, *, margin_m: float = 0.0) -> Polygon:
         """Return the area of a lane with a centre line of at least two points, with flat ends.
@@ -233,6 +237,13 @@ class Junction(Shape):
     type: str
     at_m: tuple[float, float]
     incoming_lanes: tuple[str, ...]
+
+    def _check_edges(self, shape_m: NDArray[np.float64]) -> None:
+        """Raise an InputError when it would take long to repair or to cut the outline."""
+        import shapely
+
+        check_corners(shapely.Polygon(shape_m[:, :2]), self.where)
+        super()._check_edges(shape_m)
 
 
 class Roundabout(NamedTuple):
@@ -405,6 +416,7 @@ class _NamedFile:
 
 @lru_cache(maxsize=2)
 def _read_network_file(file: _NamedFile, _content: str) -> Network:
+    pairs = PairCount(file.name)
     edges: list[Edge] = []
     connections: list[dict[str, str]] = []
     lane_links: list[tuple[str, str]] = []
@@ -419,7 +431,7 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
         try:
             match element.tag:
                 case "edge":
-                    edges.append(_parse_edge(element, file.name))
+                    edges.append(_parse_edge(element, pairs))
                 case "connection":
                     start = element.attrib["from"]
                     end = element.get("to", "")
@@ -432,7 +444,7 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
                     if start.startswith(":") or end.startswith(":"):
                         lane_links.append((f"{start}_{element.get('fromLane')}", f"{end}_{element.get('toLane')}"))
                 case "junction":
-                    junctions.append(_parse_junction(element.attrib, file.name))
+                    junctions.append(_parse_junction(element.attrib, pairs))
                 case "tlLogic":
                     phases = [_Phase.from_attributes(phase.attrib) for phase in element.iter("phase")]
                     clock = SignalClock.from_program(element)
@@ -543,9 +555,9 @@ def parse_location(element: Element, path: Path) -> Location:
     return Location(element.get("projParameter", ""), (x, y))
 
 
-def _parse_edge(element: Element, path: Path) -> Edge:
+def _parse_edge(element: Element, pairs: PairCount) -> Edge:
     function, start, end, name, kind = (element.get(key, "") for key in ("function", "from", "to", "name", "type"))
-    lanes = tuple(_parse_lane(lane, path) for lane in element.iter("lane"))
+    lanes = tuple(_parse_lane(lane, pairs) for lane in element.iter("lane"))
     crossed = tuple(element.get("crossingEdges", "").split())
     edge = Edge(element.attrib["id"], function, start, end, name, lanes, kind, crossed)
     if not function:
@@ -555,20 +567,22 @@ def _parse_edge(element: Element, path: Path) -> Edge:
     return edge
 
 
-def _parse_lane(lane: Element, path: Path) -> Lane:
+def _parse_lane(lane: Element, pairs: PairCount) -> Lane:
     width_m = float(lane.attrib["width"]) if "width" in lane.attrib else None
     length_m = float(lane.get("length", 0))
     speed_m_s = float(lane.get("speed", DEFAULT_SPEED_M_S))
-    where = f"{path}: lane {lane.get('id', '')}"
-    return Lane(lane.attrib["shape"], where, width_m, length_m, Permission.from_attributes(lane.attrib), speed_m_s)
+    where = f"{pairs.file}: lane {lane.get('id', '')}"
+    permission = Permission.from_attributes(lane.attrib)
+    return Lane(lane.attrib["shape"], where, width_m, length_m, permission, speed_m_s, pairs=pairs)
 
 
-def _parse_junction(junction: dict[str, str], path: Path) -> Junction:
+def _parse_junction(junction: dict[str, str], pairs: PairCount) -> Junction:
     name = junction["id"]
     location_m = parse_coordinate_m(junction["x"]), parse_coordinate_m(junction["y"])
     incoming = tuple(junction.get("incLanes", "").split())
-    where = f"{path}: junction {name}"
-    return Junction(junction.get("shape", ""), where, name, junction.get("type", ""), location_m, incoming)
+    where = f"{pairs.file}: junction {name}"
+    kind = junction.get("type", "")
+    return Junction(junction.get("shape", ""), where, name, kind, location_m, incoming, pairs=pairs)
 
 
 def _parse_connections(

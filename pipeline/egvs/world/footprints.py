@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, find_misspelling
 from egvs.core.grid import IntArray
-from egvs.core.polygons import check_corners, check_edge_pairs, repair_polygon
+from egvs.core.polygons import PairCount, check_corners, check_edge_pairs, repair_polygon
 from egvs.core.reading import read_json
 from egvs.core.wording import number_of
 from egvs.formats import vector_files
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 CROSSING_RINGS = "rings that cross themselves, each part that they enclose kept"
 # rings whose crossing changes no more than this share of an area cross because coordinates were rounded
 _MAX_SLIVER_SHARE = 0.01
+# corners of a strip for each point of its line
+_CORNERS_OF_STRIP = 3
 # sides of a quarter of a disc
 _QUARTER_SIDES = 4
 
@@ -109,9 +111,10 @@ def read_footprints(path: Path, world: Georeference) -> FootprintFile:
     if reading.convert is not None:
         file.repaired[f"features in {reading.description}, brought into the world frame"] += len(features)
     errors: list[InputError] = []
+    count = PairCount(path)
     for number, feature in enumerate(features):
         try:
-            file.footprints.extend(_feature_footprints(feature, number, path, file.repaired, reading))
+            file.footprints.extend(_feature_footprints(feature, number, file.repaired, reading, count))
         except InputError as error:
             errors.append(error)
     if errors:
@@ -138,13 +141,15 @@ def read_named_polygons(path: Path, world: Georeference, *, need_names: bool = F
         When the file cannot be read, or a feature encloses no area.
     """
     features, reading = _read_features(path, world)
+    count = PairCount(path)
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
         properties = _feature_properties(feature, where)
         name = str(_property(properties, "name", "" if need_names else number)).strip()
         if not name:
             raise InputError(where, "expected the property name, got none", "Name each area, for tables and messages.")
-        for polygon in to_polygons(feature.get("geometry"), properties, f"{where} ({name})", Counter(), reading):
+        geometry = feature.get("geometry")
+        for polygon in to_polygons(geometry, properties, f"{where} ({name})", Counter(), reading, count=count):
             yield name, polygon
 
 
@@ -168,12 +173,12 @@ def _feature_properties(feature: Any, where: str) -> dict[str, Any]:
 
 
 def _feature_footprints(
-    feature: Any, number: int, path: Path, repaired: Counter[str], reading: CoordinateReading
+    feature: Any, number: int, repaired: Counter[str], reading: CoordinateReading, count: PairCount
 ) -> list[Footprint]:
     """Return the footprints of one feature; repairs are counted in ``repaired``."""
-    where = f"{path}: feature {number}"
+    where = f"{count.file}: feature {number}"
     properties = _feature_properties(feature, where)
-    name = str(_property(properties, "name", f"{path.stem}_{number}"))
+    name = str(_property(properties, "name", f"{Path(str(count.file)).stem}_{number}"))
     where = f"{where} ({name})"
     misspelling = find_misspelling((key for key in properties if key not in _NOTE_KEYS), _HEIGHT_KEYS)
     if misspelling is not None:
@@ -188,7 +193,7 @@ def _feature_footprints(
         hint = "Use ground for heights above the ground below, world for z of the world frame."
         problem = f"expected {GROUND_DATUM!r} or {WORLD_DATUM!r}, got {repr(z_datum)[:80]}"
         raise InputError(f"{where}: {Z_DATUM}", problem, hint)
-    polygons = to_polygons(feature.get("geometry"), properties, where, repaired, reading)
+    polygons = to_polygons(feature.get("geometry"), properties, where, repaired, reading, count=count)
     return [Footprint(name, kind, polygon, base_m, height_m, z_datum) for polygon in polygons]
 
 
@@ -244,7 +249,7 @@ def box_pairs(
 
 def to_polygons(
     geometry: Any, properties: dict[str, Any], where: str, repaired: Counter[str],
-    reading: CoordinateReading = WORLD_READING, *, keep_crossing_parts: bool = False,
+    reading: CoordinateReading = WORLD_READING, *, keep_crossing_parts: bool = False, count: PairCount | None = None,
 ) -> list[Polygon]:  # fmt: skip
     """Convert a GeoJSON geometry to polygons in the world frame.
 
@@ -262,6 +267,8 @@ def to_polygons(
         Conversion of coordinates to the world frame.
     keep_crossing_parts
         For rings that cross themselves: keep each enclosed part, instead of an error.
+    count
+        Pairs of edges of the same file so far.
 
     Raises
     ------
@@ -279,15 +286,16 @@ def to_polygons(
         radius_m = _metres(properties, "radius_m", where)
         if radius_m <= 0:
             raise InputError(f"{where}: radius_m", f"expected a radius above 0 m, got {radius_m:g}")
-        check_edge_pairs(shape, where, radius_m)
+        check_edge_pairs(shape, where, radius_m, count)
         cap = "flat" if "Line" in shape.geom_type else "round"
         shape = shape.buffer(radius_m, quad_segs=_QUARTER_SIDES, cap_style=cap)
+        check_corners(shape, where, _CORNERS_OF_STRIP)
 
     where = f"{where}: geometry"
     if "Polygon" not in shape.geom_type:
         problem = f"expected a Polygon, LineString or Point, or a Multi form of these, got {shape.geom_type}"
         raise InputError(where, problem)
-    valid = _repair(shape, where, repaired, reading.convert is not None, keep_crossing_parts)
+    valid = _repair(shape, where, repaired, reading.convert is not None, keep_crossing_parts, count)
     polygons = _polygons_of(valid)
     if not polygons:
         raise InputError(where, "encloses no area", "Use at least three corners that are not collinear.")
@@ -342,8 +350,9 @@ def _keep_polygons(collection: BaseGeometry, repaired: Counter[str]) -> BaseGeom
 
 
 def _repair(
-    shape: BaseGeometry, where: str, repaired: Counter[str], may_be_rounded: bool, keep_crossing_parts: bool
-) -> BaseGeometry:
+    shape: BaseGeometry, where: str, repaired: Counter[str], may_be_rounded: bool, keep_crossing_parts: bool,
+    count: PairCount | None,
+) -> BaseGeometry:  # fmt: skip
     """Repair repeated points, rings that touch themselves, and rings that cross because degrees were rounded.
 
     Other rings that cross themselves are ambiguous: they are rejected, unless ``keep_crossing_parts``.
@@ -351,7 +360,7 @@ def _repair(
     import shapely
 
     if not shapely.is_valid(shape):
-        valid = repair_polygon(shape, where)
+        valid = repair_polygon(shape, where, count)
         reason = shapely.is_valid_reason(shape)
         repair = CROSSING_RINGS
         if reason.startswith("Ring Self-intersection"):

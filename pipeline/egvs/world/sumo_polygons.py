@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.numbers import number_or_nan
-from egvs.core.polygons import repair_polygon
+from egvs.core.polygons import PairCount, repair_polygon
 from egvs.core.wording import list_first
 from egvs.formats import xml
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference
@@ -136,6 +136,7 @@ class _PolygonReader:
         self._world = world
         self._readings = _coordinate_readings(path, world, expected)
         self._file = FootprintFile()
+        self._count = PairCount(path)
         self._polygon_count = 0
         self._unknown_types = Counter[str]()
         self._open_types = Counter[str]()
@@ -204,7 +205,8 @@ class _PolygonReader:
     def _widen(self, shape: _Shape, geometry: Mapping[str, object], points: Points, radius_m: float) -> list[Polygon]:
         """Return a point or line as an area."""
         reading = self._reading(shape, points)
-        return to_polygons(geometry, {"radius_m": radius_m}, shape.where, self._file.repaired, reading)
+        properties = {"radius_m": radius_m}
+        return to_polygons(geometry, properties, shape.where, self._file.repaired, reading, count=self._count)
 
     def _areas(self, shape: _Shape, points: Points) -> list[Polygon]:
         """Return what an outline encloses: each part where it crosses itself, nothing where it is flat."""
@@ -212,7 +214,7 @@ class _PolygonReader:
 
         if np.isfinite(points).all():
             outline = Polygon(points)
-            outline = repair_polygon(outline, shape.where)
+            outline = repair_polygon(outline, shape.where, self._count)
         if np.isfinite(points).all() and outline.area == 0:
             self._ignore("outlines that enclose nothing", shape.element.get("type", ""))
             return []
@@ -221,7 +223,7 @@ class _PolygonReader:
         before = repaired[CROSSING_RINGS]
         areas = to_polygons(
             {"type": "Polygon", "coordinates": [ring]}, {}, shape.where, repaired, self._reading(shape, points),
-            keep_crossing_parts=True,
+            keep_crossing_parts=True, count=self._count,
         )  # fmt: skip
         if repaired[CROSSING_RINGS] > before:
             self._crossing_names.append(shape.name)

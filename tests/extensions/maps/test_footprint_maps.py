@@ -80,6 +80,13 @@ def test_holes_bases_and_several_parts(tmp_path: Path) -> None:
     assert solid.geometry.area == pytest.approx(20 * 20 - 10 * 10 + 10 * 10, abs=1e-3)
 
 
+def test_houses_that_share_walls_all_remain(tmp_path: Path) -> None:
+    degrees = [[square(10.0 * x, 10.0 * y)] for x in range(-4, 4) for y in range(-4, 4)]
+    block = {"type": "Feature", "properties": {}, "geometry": {"type": "MultiPolygon", "coordinates": degrees}}
+    (solid,) = read(write(tmp_path / "a.geojson", block)).solids
+    assert solid.geometry.area == pytest.approx(80 * 80, rel=1e-6)
+
+
 def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
     crossing = [square(0, 0)[index] for index in (0, 2, 1, 3, 0)]
     path = write(

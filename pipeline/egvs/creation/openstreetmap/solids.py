@@ -27,7 +27,7 @@ from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY
-from egvs.core.polygons import check_corners, check_crossings, repair_polygon
+from egvs.core.polygons import PairCount, check_corners, check_crossings, repair_polygon
 from egvs.creation.carriageway import clear_of_carriageway, geometry_pieces, lanes_under, large_pieces
 from egvs.creation.junctions import Streets
 from egvs.creation.map_parts import DECK_BASE_M, DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedSolid
@@ -79,18 +79,19 @@ def map_solids(
     """
     xy = streets.node_positions(extract.nodes)
     counts = ImportCounts()
+    pairs = PairCount(extract.path)
     lanes = shapely.STRtree(list(streets.areas.values()))
 
-    objects = [find(extract, xy, counts) for find in (find_barriers, find_poles)]
+    buildings = find_buildings(extract, xy, counts, pairs, window)
+    others = find_barriers(extract, xy, counts, pairs), find_poles(extract, xy, counts)
+    decks = make_decks(bridges, xy, counts, pairs)
     solids: list[MappedSolid] = []
-    for solid in itertools.chain(
-        find_buildings(extract, xy, counts, window), *objects, make_decks(bridges, xy, counts)
-    ):
+    for solid in itertools.chain(buildings, *others, decks):
         if _is_outside(solid, window):
             counts.drop(solid.kind, OUT_OF_RANGE)
             continue
         solids += clear_of_carriageway(solid, lanes, counts)
-    for trunk, crown in find_trees(extract, xy, counts):
+    for trunk, crown in find_trees(extract, xy, counts, pairs):
         if _is_outside(crown, window):
             counts.drop("tree", OUT_OF_RANGE)
             continue
@@ -138,7 +139,7 @@ def point_at(xy: XY) -> Point:
     return Point(round(xy[0], 3), round(xy[1], 3))
 
 
-def way_lines(way: Way, xy: dict[int, XY]) -> list[LineString]:
+def way_lines(way: Way, xy: dict[int, XY], pairs: PairCount) -> list[LineString]:
     """Return a way as lines, interrupted where its nodes are not in the file."""
     lines = []
     for has_position, nodes in itertools.groupby(way.nodes, lambda node: node in xy):
@@ -147,18 +148,17 @@ def way_lines(way: Way, xy: dict[int, XY]) -> list[LineString]:
         points = [xy[node] for node in nodes]
         if len(points) > 1:
             line = LineString(points)
-            check_crossings([line], f"way {way.id}")
+            check_crossings([line], f"{pairs.file}: way {way.id}", pairs)
             lines += large_pieces(line)[0]
     return lines
 
 
-def way_area(way: Way, xy: dict[int, XY], counts: ImportCounts) -> BaseGeometry:
+def way_area(way: Way, xy: dict[int, XY], counts: ImportCounts, pairs: PairCount) -> BaseGeometry:
     """Return the area inside a closed way, repaired where its outline crosses itself."""
     polygon = Polygon([xy[node] for node in way.nodes])
-    check_corners(polygon, f"way {way.id}")
-    if polygon.is_valid:
+    repaired = repair_polygon(polygon, f"{pairs.file}: way {way.id}", pairs)
+    if repaired is polygon:
         return polygon
-    repaired = repair_polygon(polygon, f"way {way.id}")
     areas = [piece for piece in geometry_pieces(repaired) if isinstance(piece, Polygon)]
     if areas:
         counts.repaired += 1
@@ -166,7 +166,7 @@ def way_area(way: Way, xy: dict[int, XY], counts: ImportCounts) -> BaseGeometry:
 
 
 def find_buildings(
-    extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts, window: BaseGeometry | None = None
+    extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts, pairs: PairCount, window: BaseGeometry | None = None
 ) -> Iterator[MappedSolid]:
     """Yield building outlines and parts; an outline is used only where it has no parts.
 
@@ -178,6 +178,8 @@ def find_buildings(
         x, y in metres by node.
     counts
         Counts what happens to the objects.
+    pairs
+        Pairs of edges of the file so far.
     window
         What is left out is counted within it; None for everywhere.
     """
@@ -185,7 +187,7 @@ def find_buildings(
         if _is_building(tags) and (window is None or window.intersects(Point(xy[node]))):
             counts.drop("building", "no_outline")
 
-    footprints = list(_footprints(extract, xy, counts))
+    footprints = list(_footprints(extract, xy, counts, pairs))
     part_areas = [area for _, tags, area in footprints if not _is_outline(tags)]
     parts_tree = shapely.STRtree(part_areas)
     for name, tags, outline in footprints:
@@ -194,7 +196,7 @@ def find_buildings(
         if _is_outline(tags):
             parts = [part_areas[i] for i in parts_tree.query(area, predicate="intersects")]
         if parts:
-            check_crossings([area, *parts], name)
+            check_crossings([area, *parts], f"{pairs.file}: {name}", pairs)
             area = area.difference(shapely.union_all(parts))
         pieces, slivers = large_pieces(area)
         counts.slivers += slivers
@@ -240,7 +242,7 @@ def _building_type(tags: Tags) -> SolidType:
 
 
 def _footprints(
-    extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts
+    extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts, pairs: PairCount
 ) -> Iterator[tuple[str, Tags, BaseGeometry]]:
     """Yield name, tags and area of multipolygons, then of closed ways that are not outer ways of multipolygons."""
     outer_ways: set[int] = set()
@@ -254,13 +256,15 @@ def _footprints(
             continue
         ways = [extract.ways[way_id] for way_id in relation.ways("outer", "", "inner") if way_id in extract.ways]
         lines = [LineString([xy[node] for node in way.nodes if node in xy]) for way in ways if len(way.nodes) > 1]
-        check_crossings(lines, f"relation {relation.id}")
-        outer = _assemble_area(relation.ways("outer", ""), extract, xy, counts)
-        inner = _assemble_area(relation.ways("inner"), extract, xy, counts)
+        check_crossings(lines, f"{pairs.file}: relation {relation.id}", pairs)
+        outer = _assemble_area(relation.ways("outer", ""), extract, xy, counts, pairs)
+        inner = _assemble_area(relation.ways("inner"), extract, xy, counts, pairs)
         if outer is None or inner is None:
             counts.drop("building", "incomplete")
             continue
-        yield f"relation/{relation.id}", tags, outer.difference(inner)
+        area = outer.difference(inner)
+        check_corners(area, f"{pairs.file}: relation {relation.id}")
+        yield f"relation/{relation.id}", tags, area
 
     for way in extract.ways.values():
         if way.id in outer_ways:
@@ -273,7 +277,7 @@ def _footprints(
         elif not way.closed or not _has_positions(way, xy):
             counts.drop("building", "incomplete")
         else:
-            yield f"way/{way.id}", way.tags, way_area(way, xy, counts)
+            yield f"way/{way.id}", way.tags, way_area(way, xy, counts, pairs)
 
 
 def _has_positions(way: Way, xy: dict[int, XY]) -> bool:
@@ -293,7 +297,7 @@ def _multipolygon_tags(relation: Relation, extract: OsmExtract) -> Tags | None:
 
 
 def _assemble_area(
-    way_ids: list[int], extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts
+    way_ids: list[int], extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts, pairs: PairCount
 ) -> BaseGeometry | None:
     """Return the area inside rings that may consist of several ways; None when a ring is not closed."""
     areas = []
@@ -304,7 +308,7 @@ def _assemble_area(
     for way_id in way_ids:
         way = extract.ways[way_id]
         if way.closed:
-            areas.append(way_area(way, xy, counts))
+            areas.append(way_area(way, xy, counts, pairs))
         elif len(way.nodes) > 1:
             open_lines.append(LineString([xy[node] for node in way.nodes]))
 
@@ -316,7 +320,9 @@ def _assemble_area(
     return shapely.union_all(areas)
 
 
-def find_barriers(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
+def find_barriers(
+    extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts, pairs: PairCount
+) -> Iterator[MappedSolid]:
     """Yield fences, walls, hedges and guard rails: lines with a width, or areas.
 
     A kind without default sizes is counted as not modelled. Parameters as for :func:`find_buildings`.
@@ -334,9 +340,9 @@ def find_barriers(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) 
         radius_m: float | None = solid.half_width_m
         if way.closed and way.tags.get("area") == "yes" and _has_positions(way, xy):
             radius_m = None
-            geometry = shapely.MultiPolygon(large_pieces(way_area(way, xy, counts))[0])
+            geometry = shapely.MultiPolygon(large_pieces(way_area(way, xy, counts, pairs))[0])
         else:
-            geometry = shapely.MultiLineString(way_lines(way, xy))
+            geometry = shapely.MultiLineString(way_lines(way, xy, pairs))
         if geometry.is_empty:
             counts.drop("barrier", "degenerate")
             continue
@@ -344,20 +350,22 @@ def find_barriers(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) 
         yield MappedSolid(name, "barrier", geometry, extent.top_m, extent.source, extent.base_m, radius_m)
 
 
-def make_decks(bridges: Sequence[Way], xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
+def make_decks(
+    bridges: Sequence[Way], xy: dict[int, XY], counts: ImportCounts, pairs: PairCount
+) -> Iterator[MappedSolid]:
     """Yield the decks of bridges: strips as wide as the way, from ``min_height`` to ``height`` of the map.
 
     Parameters
     ----------
     bridges
         Ways on bridges.
-    xy, counts
+    xy, counts, pairs
         As for :func:`find_buildings`.
     """
     for way in bridges:
         extent = extent_from_tags(way.tags, DECK, counts)
         half_width_m = _deck_width_m(way.tags, counts) / 2
-        lines = shapely.MultiLineString(way_lines(way, xy))
+        lines = shapely.MultiLineString(way_lines(way, xy, pairs))
         if lines.is_empty:
             counts.drop("bridge", "degenerate")
             continue
@@ -409,7 +417,7 @@ def _pole_type(tags: Tags) -> SolidType | None:
 
 
 def find_trees(
-    extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts
+    extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts, pairs: PairCount
 ) -> Iterator[tuple[MappedSolid, MappedSolid]]:
     """Yield (trunk, crown) of each tree, mapped singly or as a row.
 
@@ -424,7 +432,7 @@ def find_trees(
         if way.tags.get("natural") != "tree_row":
             continue
         number = 0
-        for line in way_lines(way, xy):
+        for line in way_lines(way, xy, pairs):
             for point in _row_points(line):
                 if not single_points.is_empty and single_points.distance(point) < ROW_SPACING_M / 2:
                     counts.drop("tree", "row_tree_mapped_singly")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import random
+import re
 from pathlib import Path
 
 import numpy as np
@@ -346,3 +347,11 @@ def test_direction_of_random_lanelets_is_that_of_their_bounds(tmp_path: Path) ->
 def _direction(lanelet: DirectedLanelet) -> np.ndarray:
     along = (lanelet.center_m[-1] - lanelet.center_m[0])[:2]
     return along / np.hypot(*along)
+
+
+def test_messages_about_areas_name_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = put(tmp_path, osm_xml(NODES + WAYS + LANELET))
+    (lanelet,) = graph_of(path).lanelets.values()
+    monkeypatch.setenv("EGVS_MAX_CORNERS", "3")
+    with pytest.raises(InputError, match=rf"^{re.escape(str(path))}: lanelet 20: has 4 corners\. The limit is 3"):
+        _ = lanelet.area

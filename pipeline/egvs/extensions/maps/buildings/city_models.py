@@ -24,7 +24,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.polygons import check_crossings, repair_polygon
+from egvs.core.polygons import PairCount, check_crossings, repair_polygon
 from egvs.core.wording import by_number, list_first, number_of
 from egvs.creation.carriageway import geometry_pieces
 from egvs.creation.map_parts import (
@@ -128,9 +128,11 @@ class _Collector:
     repairs: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
     triangles: int = 0
+    pairs: PairCount = field(default_factory=PairCount)
 
     def add_file(self, file: CityModelFile) -> None:
         """Add the objects of a file; those that need a template from further down are added at its end."""
+        self.pairs = PairCount(file.path)
         systems: dict[str, ReferenceSystem] = {}
         outside = _OutsideObjects(self.context, str(file.path))
         postponed: list[CityObject] = []
@@ -177,8 +179,7 @@ class _Collector:
             return
 
         _check_coordinates(np.concatenate([ring for surface in rings for ring in surface]), where)
-        limits.HOLES.check(where, max(len(surface) - 1 for surface in rings))
-        limits.CORNERS.check(where, max(len(ring) for surface in rings for ring in surface))
+        limits.CORNERS.check(where, max(sum(map(len, surface)) for surface in rings))
         placed = _Placed(rings, system)
         if not outside.is_in_window(placed, where):
             self.counts.drop(kind, OUT_OF_RANGE)
@@ -251,7 +252,7 @@ class _Collector:
         if height_m is None and kind != "building":
             self.counts.drop(kind, "no_height")
             return
-        area = _footprint(rings_m, where)
+        area = _footprint(rings_m, where, self.pairs)
         if area.is_empty:
             self.counts.drop(kind, "degenerate")
             return
@@ -391,15 +392,15 @@ def _check_coordinates(points: FloatArray, where: str) -> None:
         raise InputError(where, problem, "Check the file's coordinates and its reference system.")
 
 
-def _footprint(rings_m: Sequence[Sequence[FloatArray]], where: str) -> BaseGeometry:
+def _footprint(rings_m: Sequence[Sequence[FloatArray]], where: str, pairs: PairCount) -> BaseGeometry:
     """Return the area under surfaces, seen from above; empty if they have none."""
     areas = []
     for surface in rings_m:
         outer, *holes = [ring[:, :2] for ring in surface]
         if len(outer) > 2:
             surface_m = shapely.Polygon(outer, [hole for hole in holes if len(hole) > 2])
-            areas.append(repair_polygon(surface_m, where))
-    check_crossings(areas, where)
+            areas.append(repair_polygon(surface_m, where, pairs))
+    check_crossings(areas, where, pairs)
     area = shapely.union_all(areas)
     polygons = [piece for piece in geometry_pieces(area) if piece.geom_type == "Polygon"]
     return polygons[0] if len(polygons) == 1 else shapely.MultiPolygon(polygons)

@@ -21,7 +21,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
-from egvs.core.polygons import check_corners, repair_polygon
+from egvs.core.polygons import PairCount, repair_polygon
 from egvs.core.reading import read_json, translate_errors
 from egvs.creation.carriageway import geometry_pieces
 from egvs.creation.map_parts import DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MapContext, MappedSolid, SolidMap
@@ -52,12 +52,13 @@ def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
 
 def _read_file(path: Path, context: MapContext, counts: ImportCounts) -> Iterator[MappedSolid]:
     features, crs = _read_features(path, context)
+    pairs = PairCount(path)
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
         if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
             raise InputError(where, "expected a GeoJSON feature with geometry and properties", _HINT)
         columns = {str(key).lower(): value for key, value in (feature.get("properties") or {}).items()}
-        area = _read_area(feature.get("geometry"), crs, context, where, counts)
+        area = _read_area(feature.get("geometry"), crs, context, where, counts, pairs)
         if area is None:
             continue
         solid = _make_solid(columns, area, f"{path.stem}/{number}", counts)
@@ -87,7 +88,7 @@ def _read_features(path: Path, context: MapContext) -> tuple[list[Any], str | No
 
 
 def _read_area(
-    geometry: Any, crs: str | None, context: MapContext, where: str, counts: ImportCounts
+    geometry: Any, crs: str | None, context: MapContext, where: str, counts: ImportCounts, pairs: PairCount
 ) -> BaseGeometry | None:
     """Return the area of a feature in the world frame; None, with a count, if it has none."""
     if geometry is None:
@@ -106,9 +107,8 @@ def _read_area(
         counts.drop("building", "no_outline")
         return None
     moved = shapely.transform(shape, lambda xy: context.to_world(xy, crs, where))
-    check_corners(moved, f"{where}: geometry")
     counts.repaired += not moved.is_valid
-    moved = repair_polygon(moved, f"{where}: geometry")
+    moved = repair_polygon(moved, f"{where}: geometry", pairs)
     polygons = [piece for piece in geometry_pieces(moved) if piece.geom_type == "Polygon" and piece.area > 0]
     if not polygons:
         counts.drop("building", "degenerate")

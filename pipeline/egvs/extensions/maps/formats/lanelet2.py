@@ -114,6 +114,8 @@ class LaneletMap:
         Identifiers of lanelets that are left out, since they do not have one left and one right bound.
     missing_members
         How many members of regulatory elements are not in the file.
+    path
+        The file, for messages.
     """
 
     points: dict[int, MapPoint]
@@ -123,6 +125,7 @@ class LaneletMap:
     is_autoware: bool = False
     incomplete: tuple[int, ...] = ()
     missing_members: int = 0
+    path: Path = Path("map")
 
 
 def is_lanelet2(path: Path) -> bool:
@@ -222,7 +225,7 @@ class _Reader:
             missing += len(members) - len(present)
             regulations[identifier] = Regulation(identifier, present, tags)
         return LaneletMap(
-            self._points, self._lines, lanelets, regulations, self._is_autoware, tuple(incomplete), missing
+            self._points, self._lines, lanelets, regulations, self._is_autoware, tuple(incomplete), missing, self._path
         )
 
     def _add_relation(self, where: str, identifier: int, element: Element, tags: Tags) -> None:

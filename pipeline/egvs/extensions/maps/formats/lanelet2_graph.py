@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core import polylines
 from egvs.core.grid import FloatArray
-from egvs.core.polygons import repair_polygon
+from egvs.core.polygons import PairCount, repair_polygon
 from egvs.extensions.maps.formats.lanelet2 import Lanelet, LaneletMap
 from egvs.formats.osm import Tags
 
@@ -95,6 +95,8 @@ class DirectedLanelet:
         The lanelet's tags.
     regulations
         Identifiers of its regulatory elements.
+    pairs
+        Pairs of edges of the file so far.
     """
 
     key: LaneletKey
@@ -108,6 +110,7 @@ class DirectedLanelet:
     right_along: bool
     tags: Tags
     regulations: tuple[int, ...] = ()
+    pairs: PairCount = field(default_factory=PairCount, compare=False, repr=False)
 
     @cached_property
     def center_m(self) -> FloatArray:
@@ -125,7 +128,7 @@ class DirectedLanelet:
     def area(self) -> BaseGeometry:
         """The ground between the bounds."""
         ring = np.vstack([self.left_m[:, :2], self.right_m[::-1, :2]])
-        return repair_polygon(Polygon(ring), f"lanelet {self.key}")
+        return repair_polygon(Polygon(ring), f"{self.pairs.file}: lanelet {self.key}", self.pairs)
 
     @property
     def length_m(self) -> float:
@@ -202,9 +205,10 @@ def build_graph(
         Which lanelets to take.
     """
     lanelets: dict[LaneletKey, DirectedLanelet] = {}
+    pairs = PairCount(lanelet_map.path)
     for lanelet in lanelet_map.lanelets.values():
         if choose(lanelet):
-            forward = orient_lanelet(lanelet, lanelet_map, xyz_m)
+            forward = orient_lanelet(lanelet, lanelet_map, xyz_m, pairs)
             lanelets[forward.key] = forward
             if not is_one_way(lanelet.tags):
                 backward = _reverse(forward)
@@ -276,7 +280,9 @@ def split_lanelets(graph: LaneletGraph, shares: Mapping[LaneletKey, float]) -> L
     return connect_lanelets(dict(sorted(lanelets.items())))
 
 
-def orient_lanelet(lanelet: Lanelet, lanelet_map: LaneletMap, xyz_m: Mapping[int, FloatArray]) -> DirectedLanelet:
+def orient_lanelet(
+    lanelet: Lanelet, lanelet_map: LaneletMap, xyz_m: Mapping[int, FloatArray], pairs: PairCount
+) -> DirectedLanelet:
     """Return a lanelet with both bounds in driving direction, by rules 1 and 2."""
     left, right = (lanelet_map.lines[line].nodes for line in (lanelet.left, lanelet.right))
     left_m, right_m = (np.array([xyz_m[node] for node in nodes]) for nodes in (left, right))
@@ -293,7 +299,7 @@ def orient_lanelet(lanelet: Lanelet, lanelet_map: LaneletMap, xyz_m: Mapping[int
         right, right_m = right[::-1], right_m[::-1]
     return DirectedLanelet(
         LaneletKey(lanelet.id), (left[0], left[-1]), (right[0], right[-1]), left_m, right_m,
-        lanelet.left, lanelet.right, left_along, right_along, lanelet.tags, lanelet.regulations,
+        lanelet.left, lanelet.right, left_along, right_along, lanelet.tags, lanelet.regulations, pairs,
     )  # fmt: skip
 
 
@@ -310,7 +316,7 @@ def _reverse(lanelet: DirectedLanelet) -> DirectedLanelet:
     return DirectedLanelet(
         LaneletKey(lanelet.key.id, True), lanelet.right_ends[::-1], lanelet.left_ends[::-1],
         lanelet.right_m[::-1], lanelet.left_m[::-1], lanelet.right_line, lanelet.left_line,
-        not lanelet.right_along, not lanelet.left_along, lanelet.tags, lanelet.regulations,
+        not lanelet.right_along, not lanelet.left_along, lanelet.tags, lanelet.regulations, lanelet.pairs,
     )  # fmt: skip
 
 

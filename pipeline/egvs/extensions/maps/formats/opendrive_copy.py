@@ -6,8 +6,8 @@ traffic, expects the ids of lanes of right-hand traffic, which it draws on the o
 divides by the curvature of an arc, and by the change of curvature along a spiral: where these are so small that the
 shape differs from a line or an arc by less than :data:`_SAME_SHAPE_M`, the simpler shape is written. It reads no direct
 junctions (:mod:`egvs.extensions.maps.formats.direct_junctions`), no borders of lanes, which become widths, and no speed
-limits of roads, which become those of their lanes. It moves the ends of roads to virtual junctions, which are left out. What it
-need not know is left out.
+limits of roads, which become those of their lanes. It moves the ends of roads to virtual junctions, which are left out.
+What it need not know is left out.
 """
 
 from __future__ import annotations
