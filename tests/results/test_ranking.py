@@ -203,8 +203,8 @@ def test_what_people_notice_is_an_upper_limit_for_sensors_without_losses(tmp_pat
     demo, off = load(SCENARIOS / "demo"), load(SCENARIOS / "demo", ["effects.range_limit=false"])
     assert sensor_text.upper_limit_note(off, ["VLP-32C", "VLP-32C"]) == (
         "Losses of returns are not simulated for VLP-32C (effects.range_limit = false), but the curves of what people "
-        "notice are for points with losses: read that share as an upper limit. The level of corrected detectors was "
-        "not measured without losses either; the order of sites was."
+        "notice are for points with losses: read that share as an upper limit. The level of corrected detectors is "
+        "unknown without losses, too."
     )
     assert sensor_text.upper_limit_note(demo, ["VLP-32C"]) == ""
     unrated = load(

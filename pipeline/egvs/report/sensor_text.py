@@ -125,8 +125,8 @@ def upper_limit_note(scenario: Scenario, sensors: Iterable[str]) -> str:
         reason = f"{by_number(len(names), 'it has', 'they have')} no rated range"
     return (
         f"Losses of returns are not simulated for {join_names(names)} ({reason}), but the curves of what people notice "
-        "are for points with losses: read that share as an upper limit. The level of corrected detectors was not "
-        "measured without losses either; the order of sites was."
+        "are for points with losses: read that share as an upper limit. The level of corrected detectors is unknown "
+        "without losses, too."
     )
 
 
