@@ -142,10 +142,16 @@ def test_the_printed_error_is_the_measured_one() -> None:
     names = {"corrected": "", "uncorrected": UNCORRECTED}
     for model, ending in names.items():
         for detector in DETECTORS:
-            rms = math.sqrt(np.mean([float(row["upper_rms"]) ** 2 for row in _street_levels(model, detector)]))
-            assert STUDY.street_levels.error_points[detector + ending] == math.ceil(rms)
-    other = math.sqrt(np.mean([float(row["upper_rms"]) ** 2 for row in _street_levels("corrected", "range_image")]))
-    assert STUDY.street_levels.other_detector_error_points == math.ceil(other)
+            for group, points in STUDY.street_levels.error_points[detector + ending].items():
+                errors = [float(row["upper_rms"]) for row in _street_levels(model, detector, group)]
+                assert points == math.ceil(math.sqrt(np.mean(np.square(errors))))
+            errors = [float(row["upper_rms"]) for row in _street_levels(model, detector)]
+            assert STUDY.street_levels.street_error_points[detector + ending] == (
+                round(min(errors)),
+                round(max(errors)),
+            )
+    other = [float(row["upper_rms"]) for row in _street_levels("corrected", "range_image")]
+    assert STUDY.street_levels.other_detector_error_points == (round(min(other)), round(max(other)))
     for detector, groups in STUDY.street_levels.groups.items():
         for group in groups:
             errors = [float(row["error"]) for row in _street_levels("corrected", detector, group)]
@@ -160,7 +166,9 @@ def test_the_order_at_held_out_junctions_stays_within_its_interval() -> None:
                 interval[row["junction"], row["detector"]] = float(row["rho low"]), float(row["rho high"])
     with (DATA / "street_levels_order.csv").open(encoding="utf-8", newline="") as lines:
         rows = [row for row in csv.DictReader(lines) if row["losses"] == "no"]
-    assert len(rows) >= 9
+    assert len(rows) == 3 * STUDY.street_levels.junctions_of_larger_study
+    rho = [float(row["corrected"]) for row in rows]
+    assert (round(min(rho), 2), round(max(rho), 2)) == STUDY.street_levels.rho_in_larger_study
     for row in rows:
         low, high = interval[row["junction"], row["detector"]]
         assert low < float(row["corrected"]) < high

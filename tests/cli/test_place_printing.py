@@ -107,10 +107,10 @@ def test_values_in_fused_clouds_follow_the_assumption(capsys: pytest.CaptureFixt
     assert text.endswith(f"{first}; c, a should find 0.4 ± 0.2 percentage points more there.\n")
     noticed = FusedPlan(steps, noticed=NoticedShare(0.985, 0.011, 0.985, 0.985))
     text = printed(placed_two(fused=noticed), capsys)
-    assert text.endswith(f"{first}. People would notice 98 ± 1 % of vehicles there.\n")
+    assert text.endswith(f"{first}. People would notice 98 ± 10 % of vehicles there.\n")
     alone = FusedPlan(steps[:1], noticed=NoticedShare(0.985, 0.011, 0.985, 0.985))
     text = printed(placed_two(fused=alone), capsys)
-    assert text.endswith(f"{LAST_LINES}People would notice 98 ± 1 % of vehicles in the sweeps of this sensor.\n")
+    assert text.endswith(f"{LAST_LINES}People would notice 98 ± 10 % of vehicles in the sweeps of this sensor.\n")
     assert printed(placed_two(fused=FusedPlan(steps[:1])), capsys).endswith(LAST_LINES)
 
 

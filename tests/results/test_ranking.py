@@ -16,11 +16,9 @@ from egvs.report.sections import describe_poles_on_road
 from egvs.results.labels import SCORE_LABELS
 from egvs.results.levels import (
     MAX_LEVEL_ERROR,
+    DetectionLevel,
     GroupLevel,
     NoticedShare,
-    detection_range,
-    found_text,
-    level_error,
 )
 from egvs.results.ranking import Pole, RankedSite, Ranking, ScoreValue
 from egvs.results.sensors import SensorComparison
@@ -82,24 +80,27 @@ def with_noticed(*rows: tuple[str, float, float], low: float = 0.0, high: float 
     return Ranking(tuple(sites), tuple(sites[:1]), ())
 
 
-BOTH = ("cluster", "pointpillars")
+BOTH = DetectionLevel(("cluster", "pointpillars"))
 
 
 def test_the_headline_names_whose_level_it_is_with_the_measured_error() -> None:
-    error = level_error(BOTH, 0.01)
-    assert STUDY.street_levels.error_points["cluster"] < 100.0 * error < MAX_LEVEL_ERROR * 100.0
+    error = BOTH.error(0.01)
+    assert STUDY.street_levels.error_points["cluster"]["all"] < 100.0 * error < MAX_LEVEL_ERROR * 100.0
     found = f"should find 84 ± {math.ceil(100.0 * error)} % of vehicles"
     ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
-    assert ranking_text.headline(ranked, has_traffic=True, detectors=BOTH) == (
-        f"a is the best of 2 sites: detectors (cluster, pointpillars) {found}; people would notice 90 ± 2 % in its "
-        "sweeps"
+    assert ranking_text.headline(ranked, has_traffic=True, found=BOTH) == (
+        f"a is the best of 2 sites: detectors (cluster, pointpillars) {found}; people would notice 90 ± 10 % in its "
+        "sweeps (curves of one junction)"
     )
-    of_one = f"should find 84 ± {math.ceil(100.0 * level_error(['cluster'], 0.01))} % of vehicles"
-    assert ranking_text.headline(with_noticed(("a", 0.841, 0.897)), has_traffic=True, detectors=("cluster",)) == (
-        f"a, the only site: the detector cluster {of_one}; people would notice 90 ± 2 % in its sweeps"
+    of_one = f"should find 84 ± {math.ceil(100.0 * DetectionLevel(('cluster',)).error(0.01))} % of vehicles"
+    assert ranking_text.headline(
+        with_noticed(("a", 0.841, 0.897)), has_traffic=True, found=DetectionLevel(("cluster",))
+    ) == (
+        f"a, the only site: the detector cluster {of_one}; people would notice 90 ± 10 % in its sweeps (curves of one "
+        "junction)"
     )
     tie = with_noticed(("a", 0.841, 0.897), ("b", 0.841, 0.897))
-    assert ranking_text.headline(replace(tie, best=tie.sites), has_traffic=True, detectors=BOTH).startswith(
+    assert ranking_text.headline(replace(tie, best=tie.sites), has_traffic=True, found=BOTH).startswith(
         f"All 2 sites score the same: detectors (cluster, pointpillars) {found}; "
     )
     both_first = with_noticed(("a", 0.841, 0.897), ("b", 0.841, 0.897), ("c", 0.5, 0.6))
@@ -107,30 +108,60 @@ def test_the_headline_names_whose_level_it_is_with_the_measured_error() -> None:
         f"a and b share first place among 3 sites; from a, detectors (cluster, pointpillars) {found}"
     )
     without = by_vehicles(("a", 50.0, 0.841), ("b", 90.0, 0.8))  # a run of an earlier version
-    assert ranking_text.headline(without, has_traffic=True, detectors=BOTH) == (
+    assert ranking_text.headline(without, has_traffic=True, found=BOTH) == (
         f"a is the best of 2 sites: detectors (cluster, pointpillars) {found}"
     )
 
 
-def test_a_level_with_a_large_or_unknown_error_is_a_range() -> None:
-    """At most ± 10 is printed: beyond that, and for a model whose level was not measured, a range."""
-    assert found_text(0.5, BOTH, 0.2) == "25 to 75 %"
-    assert found_text(0.5, ["pointpillars_sensor"], 0.01) == "40 to 60 %"
-    assert found_text(0.97, ["pointpillars_sensor"], None) == "85 to 100 %"
-    assert re.fullmatch(r"50 ± \d+ %", found_text(0.5, BOTH, None))
+def test_a_level_with_a_large_error_is_a_range() -> None:
+    """At most ± 10 is printed."""
+    assert BOTH.text(0.5, 0.2) == "25 to 75 %"
+    assert re.fullmatch(r"50 ± \d+ %", BOTH.text(0.5, None))
+
+
+def test_no_number_is_printed_for_a_level_that_was_not_measured() -> None:
+    """A model that was compared with no street; corrected models without losses. The order of sites stays."""
+    ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
+    assert ranking_text.headline(ranked, has_traffic=True, found=DetectionLevel(("pointpillars_sensor",))) == (
+        "a is the best of 2 sites: level not measured for the detector pointpillars_sensor; people would notice 90 ± "
+        "10 % in its sweeps (curves of one junction)"
+    )
+    without = replace(BOTH, has_losses=False)
+    assert ranking_text.headline(by_vehicles(("a", 1.0, 0.9), ("b", 1.0, 0.8)), True, without) == (
+        "a is the best of 2 sites: level not measured for detectors (cluster, pointpillars) without losses of returns"
+    )
+    assert DetectionLevel(("cluster_uncorrected",), has_losses=False).is_measured
+    off = load(SCENARIOS / "demo", ["effects.range_limit=false"])
+    assert not sensor_text.detection_level(off, BOTH.detectors, "VLP-32C", ()).is_measured
+    assert sensor_text.detection_level(load(SCENARIOS / "demo"), BOTH.detectors, "VLP-32C", ()).is_measured
+
+
+def test_the_level_error_is_that_of_the_groups() -> None:
+    """Weighted by the shares of the measured groups, and added: they may have one cause."""
+    noticed = NoticedShare(0.9, 0.02, 0.9, 0.9)
+    shares = (("cars", 0.6), ("larger vehicles", 0.36), ("people", 0.04))
+    groups = tuple(GroupLevel(name, 10, share, 0.5, 0.03, noticed) for name, share in shares)
+    found = replace(BOTH, groups=groups)
+    points = STUDY.street_levels.error_points["pointpillars"]
+    expected = (0.6 * points["cars"] + 0.36 * points["larger vehicles"]) / 0.96
+    assert 100.0 * found.error(None) == pytest.approx(expected)
+    assert 100.0 * found.error(0.05) == pytest.approx(math.hypot(expected, 5.0))
+    of_groups = [f"50 ± {math.ceil(math.hypot(points[name], 3.0))} %" for name in ("cars", "larger vehicles")]
+    assert [found.group_text(group) for group in groups] == [*of_groups, "level not measured"]
 
 
 def test_a_level_that_nothing_supports_is_a_range() -> None:
     ranked = with_noticed(("a", 0.841, 0.7), ("b", 0.8, 0.89), low=0.02, high=0.09)
     assert not ranked.sites[0].noticed.is_measured
-    assert ranking_text.headline(ranked, has_traffic=True, detectors=BOTH).endswith(
-        "people would notice 65 to 80 % in its sweeps"
+    assert ranking_text.headline(ranked, has_traffic=True, found=BOTH).endswith(
+        "people would notice 65 to 80 % in its sweeps (curves of one junction)"
     )
-    assert with_noticed(("a", 0.841, 0.7), low=0.02, high=0.07).sites[0].noticed.text == "70 ± 2 %"
+    assert with_noticed(("a", 0.841, 0.7), low=0.02, high=0.07).sites[0].noticed.text == "70 ± 10 %"
     assert [NoticedShare(0.5, None, low, high).cell for low, high in ((0.45, 0.65), (0.0, 1.0), (0.81, 0.99))] == [
         "45 to 65 %", "0 to 100 %", "80 to 100 %",
     ]  # fmt: skip
-    assert NoticedShare(0.5, None, 0.5, 0.5).text == "50 %"
+    assert NoticedShare(0.5, None, 0.5, 0.5).text == "50 ± 10 %"
+    assert NoticedShare(0.5, 0.12, 0.5, 0.5).text == "50 ± 12 %"  # a larger error of the curves counts
 
 
 def test_what_detectors_find_is_a_range_where_many_vehicles_are_of_no_measured_group() -> None:
@@ -141,17 +172,19 @@ def test_what_detectors_find_is_a_range_where_many_vehicles_are_of_no_measured_g
         GroupLevel("larger vehicles", 80, 0.2, 0.4, 0.02, noticed),
         GroupLevel("people", 20, 0.05, 0.5, 0.02, noticed),
     )
-    assert detection_range([cars, larger, people], BOTH) is None  # 5 % are people
-    found = detection_range([cars, larger, people], ["cluster_uncorrected"])
-    assert (found.low, found.high, found.outside) == pytest.approx((0.675, 0.925, 0.25))
+    assert replace(BOTH, groups=(cars, larger, people)).range is None  # 5 % are people
+    of_cars = DetectionLevel(("cluster_uncorrected",), (cars, larger, people))
+    found = of_cars.range
+    assert found is not None and (found.low, found.high, found.outside) == pytest.approx((0.675, 0.925, 0.25))
     ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
-    assert ranking_text.headline(ranked, has_traffic=True, detectors=BOTH, found=found) == (
-        "a is the best of 2 sites: detectors (cluster, pointpillars) should find 65 to 95 % of vehicles (nothing is "
-        "known of the 25 % that are not cars); people would notice 90 ± 2 % in its sweeps"
+    assert ranking_text.headline(ranked, has_traffic=True, found=of_cars) == (
+        "a is the best of 2 sites: the detector cluster_uncorrected should find 65 to 95 % of vehicles (nothing is "
+        "known of the 25 % that are not cars); people would notice 90 ± 10 % in its sweeps (curves of one "
+        "junction)"
     )
-    assert detection_range([replace(people, weight_share=1.0)], BOTH).text == "0 to 100 %"
-    few = [replace(cars, weight_share=0.9), replace(people, weight_share=0.1)]
-    assert detection_range(few, BOTH) is None and detection_range((), BOTH) is None
+    assert replace(BOTH, groups=(replace(people, weight_share=1.0),)).text(0.5, None) == "0 to 100 %"
+    few = (replace(cars, weight_share=0.9), replace(people, weight_share=0.1))
+    assert replace(BOTH, groups=few).range is None and BOTH.range is None
 
 
 def test_a_pole_from_which_people_notice_clearly_more_is_named() -> None:
@@ -170,7 +203,8 @@ def test_what_people_notice_is_an_upper_limit_for_sensors_without_losses(tmp_pat
     demo, off = load(SCENARIOS / "demo"), load(SCENARIOS / "demo", ["effects.range_limit=false"])
     assert sensor_text.upper_limit_note(off, ["VLP-32C", "VLP-32C"]) == (
         "Losses of returns are not simulated for VLP-32C (effects.range_limit = false), but the curves of what people "
-        "notice are for points with losses: read that share as an upper limit."
+        "notice are for points with losses: read that share as an upper limit. The level of corrected detectors is "
+        "unknown without losses, too."
     )
     assert sensor_text.upper_limit_note(demo, ["VLP-32C"]) == ""
     unrated = load(

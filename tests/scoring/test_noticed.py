@@ -165,8 +165,9 @@ def test_errors_of_curves_add_to_those_of_the_traffic() -> None:
     assert 100.0 * estimate.differences(np.array([0]), np.array([1])).se == pytest.approx([1.0])
     assert estimate.bias == pytest.approx([0.0, 0.0], abs=1e-12)
     assert estimate.freedom == 3.0
-    # the errors of the curves are known: degrees of freedom grow
-    assert estimate._freedoms(np.array([0])) == pytest.approx([(traffic + 4.0) ** 2 / (traffic**2 / 3.0)])
+    # Satterthwaite's: 3 of the traffic, and 10 of all values of the curves together
+    expected = (traffic + 5.0) ** 2 / (traffic**2 / 3.0 + 5.0**2 / 10.0)
+    assert estimate._freedoms(np.array([1])) == pytest.approx([expected])
 
 
 # ---- runs

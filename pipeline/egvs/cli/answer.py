@@ -26,9 +26,9 @@ from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import by_number, number_of
 from egvs.report import ranking_text, reliability, sections
 from egvs.report.extension_sections import read_sections
-from egvs.report.sensor_text import has_losses, range_note, upper_limit_note
+from egvs.report.sensor_text import detection_level, has_losses, range_note, upper_limit_note
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
-from egvs.results.levels import DetectionRange, detection_range, read_levels
+from egvs.results.levels import NO_DETECTORS, DetectionLevel, read_levels
 from egvs.results.ranking import Pole, RankedSite, Ranking
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import NOTICED
@@ -111,9 +111,9 @@ def _print_ranking(
 ) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
     hint = ranking_text.recorded_frames_hint(scenario, ranked, record.stages)
-    detectors = scenario.score.ranking_detectors
-    found = detection_range(read_levels(RunFolder(folder).levels, ranked.sites[0].site), detectors)
-    print_sentences([verdict(ranked, hint, detectors, found)])
+    groups = read_levels(RunFolder(folder).levels, ranked.sites[0].site)
+    found = detection_level(scenario, scenario.score.ranking_detectors, ranked.sites[0].sensor, groups)
+    print_sentences([verdict(ranked, hint, found)])
     for part in read_sections(RunFolder(folder), scenario, record.stages):
         for warning in part.warnings:
             print_sentences([f"{warning.sentence} See {RunFolder(folder).report}#{part.section.name}"])
@@ -139,12 +139,12 @@ def _print_ranking(
         print_sentences([preference])
 
 
-def verdict(ranked: Ranking, hint: str = "", detectors: Sequence[str] = (), found: DetectionRange | None = None) -> str:
+def verdict(ranked: Ranking, hint: str = "", found: DetectionLevel = NO_DETECTORS) -> str:
     """Return a few sentences: the best site, how clearly it leads and, if unclear, the ``hint`` on what helps.
 
-    ``detectors`` are those of the score that ranks; ``found`` as for :func:`egvs.report.ranking_text.level`.
+    ``found`` as for :func:`egvs.report.ranking_text.level`.
     """
-    sentences = [f"{ranking_text.headline(ranked, has_traffic=True, detectors=detectors, found=found)}."]
+    sentences = [f"{ranking_text.headline(ranked, has_traffic=True, found=found)}."]
     if lead := ranking_text.lead(ranked, hint):
         sentences.append(lead)
     return " ".join(sentences)

@@ -114,7 +114,7 @@ def run(
     if not screen.any_stage_ran:
         screen.say("no stage ran: no input has changed since the last run")
     if all_:
-        run_tables.print_scores(folder, record, before_answer=True)
+        run_tables.print_scores(folder, loaded, record, before_answer=True)
     if verbose:
         run_tables.print_costs(folder, record)
     run_tables.print_audit(record)
@@ -264,7 +264,7 @@ def _run_stage(
         record = run.run_one(
             stage, loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **stage_options
         )
-    run_tables.print_stage_files(folder, stage, record, top=top)
+    run_tables.print_stage_files(folder, loaded, stage, record, top=top)
 
 
 @app.command()

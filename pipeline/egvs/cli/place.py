@@ -279,8 +279,13 @@ def describe_plan(placed: SensorPlan) -> str:
 
 def describe_errors(placed: SensorPlan) -> str:
     """Return what follows "±", or why there are no standard errors."""
+    from egvs.scenario.score_config import DEFAULT_SCORE
+
     if placed.has_errors:
-        return f"± is one standard error, from {placed.errors_from}"
+        text = f"± is one standard error, from {placed.errors_from}"
+        if placed.by.name == DEFAULT_SCORE:
+            text += "; it is without the error of the level, which was measured for single sensors only"
+        return text
     return f"no standard errors: {placed.errors_from}"
 
 

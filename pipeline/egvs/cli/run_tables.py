@@ -28,14 +28,16 @@ from egvs.cli.console import (
 from egvs.core.errors import collect_warnings
 from egvs.core.wording import format_percent
 from egvs.report import ranking_text
+from egvs.report.sensor_text import detection_level
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability
-from egvs.results.levels import GROUPS_NOTE, GroupLevel, read_levels
+from egvs.results.levels import GROUPS_NOTE, DetectionLevel, GroupLevel, read_levels
 from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pole
 from egvs.scenario.score_config import ALL_DETECTORS, DEFAULT_SCORE, NOTICED
 from egvs.sensors.return_model import NEGLIGIBLE_LOSS, ReturnModel
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
+    from egvs.scenario.model import Scenario
     from egvs.sensors.beam_files import BeamFile
     from egvs.sensors.sensor import Sensor
     from egvs.stages.check import CheckReport
@@ -65,24 +67,30 @@ def _artefact_paths(folder: Path, record: RunRecord, stage: str) -> list[str]:
     return [str(folder / name) for name in record.stages[stage].artefacts]
 
 
-def print_stage_files(folder: Path, stage: str, record: RunRecord, *, top: int | None = None) -> None:
+def print_stage_files(
+    folder: Path, scenario: Scenario, stage: str, record: RunRecord, *, top: int | None = None
+) -> None:
     """Print the files that one stage wrote; after the score stage, the ranking too."""
     out = console(_RESULT_FILE_WIDTH)
     if stage == "score":
-        print_scores(folder, record, top)
+        print_scores(folder, scenario, record, top)
         print_audit(record)
     clouds = record.stages[stage].summary.get("clouds", ())
     for path in (*_artefact_paths(folder, record, stage), *(str(folder / name) for name in clouds)):
         out.print(path)
 
 
-def print_scores(folder: Path, record: RunRecord, top: int | None = None, *, before_answer: bool = False) -> None:
+def print_scores(
+    folder: Path, scenario: Scenario, record: RunRecord, top: int | None = None, *, before_answer: bool = False
+) -> None:
     """Print the ranking, the best candidate of each pole, and the ranking by period; ``top`` of each, or all.
 
     Parameters
     ----------
-    folder, record
-        The run folder and its record.
+    folder
+        The run folder.
+    scenario, record
+        Its scenario and its record.
     top
         How many of the best sites, poles and so on are printed; all for None.
     before_answer
@@ -102,7 +110,7 @@ def print_scores(folder: Path, record: RunRecord, top: int | None = None, *, bef
     best = next(site for site in sites if site.rank == 1)
     levels = read_levels(RunFolder(folder).levels, best.site)
     if len(levels) > 1:
-        out.print(levels_table(best.site, levels))
+        out.print(levels_table(best.site, detection_level(scenario, scenario.score.detectors, best.sensor, levels)))
     if top is not None and len(sites) > top:
         out.print(f"... and {len(sites) - top:,} more; omit --top, or see {folder / 'scores.parquet'}")
     if not before_answer and len({site.pole for site in sites}) < len(sites):
@@ -194,15 +202,15 @@ def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | Non
     return make_table(columns, shown, width=width, caption=caption)
 
 
-def levels_table(site: str, levels: Sequence[GroupLevel]) -> Table:
+def levels_table(site: str, found: DetectionLevel) -> Table:
     """Return what detectors should find and people would notice of each group of road users from a site."""
     columns: list[Column[GroupLevel]] = [
         Column(f"from {site}", lambda level: level.road_users, "left"),
         Column("observations", lambda level: f"{level.observations:,}"),
-        Column(SCORE_LABELS[DEFAULT_SCORE].head, lambda level: level.detection_text),
+        Column(SCORE_LABELS[DEFAULT_SCORE].head, found.group_text),
         Column(SCORE_LABELS[NOTICED].head, lambda level: level.noticed.text),
     ]
-    return make_table(columns, levels, caption=GROUPS_NOTE)
+    return make_table(columns, found.groups, caption=GROUPS_NOTE)
 
 
 def _ranking_score(sites: Sequence[RankedSite]) -> ScoreLabel:

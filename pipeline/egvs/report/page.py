@@ -10,7 +10,7 @@ no ``run.json``; the page then says that costs are unknown.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -57,7 +57,7 @@ from egvs.report.sections import (
 from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, has_losses, range_note
 from egvs.results import labels as formatting
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.levels import GROUPS_NOTE, GroupLevel, detection_range, read_levels
+from egvs.results.levels import GROUPS_NOTE, DetectionLevel, GroupLevel, read_levels
 from egvs.results.map_credits import read_map_credits
 from egvs.results.ranking import RankedSite, Ranking, share_of_limit
 from egvs.results.sensors import SensorComparison
@@ -379,6 +379,7 @@ def render_page(contents: PageContents) -> str:
         **contents.study,
         **(contents.plan or {}),
         **_ranking_values(contents.ranking),
+        "found_level": _found_level(contents, contents.scenario.score.detectors),
         **_setting_values(contents),
         **_sensor_values(contents),
         **_cost_values(contents.stages),
@@ -429,6 +430,11 @@ def _ranking_values(ranking: Ranking) -> dict[str, Any]:
         "noticed": SCORE_LABELS[NOTICED] if ranking.has_noticed else None,
         "groups_note": GROUPS_NOTE,
     }
+
+
+def _found_level(contents: PageContents, detectors: Sequence[str]) -> DetectionLevel:
+    """Return what is known of the share that these detectors find from the best site."""
+    return sensor_text.detection_level(contents.scenario, detectors, contents.ranking.sites[0].sensor, contents.levels)
 
 
 def _setting_values(contents: PageContents) -> dict[str, Any]:
@@ -503,9 +509,9 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     scenario, ranking, tpog = contents.scenario, contents.ranking, contents.tpog
     has_occlusion = "moving_occlusion" in scenario.effects.named
     setting = egvs_setting(scenario.gamma, tpog.grid.voxel_m, moving_occlusion=has_occlusion)
-    detectors = scenario.score.ranking_detectors
+    found = _found_level(contents, scenario.score.ranking_detectors)
     return {
-        "headline": headline(ranking, bool(tpog.counts.any()), detectors, detection_range(contents.levels, detectors)),
+        "headline": headline(ranking, bool(tpog.counts.any()), found),
         "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
         "preference": noticed_preference(ranking),

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.wording import by_number, format_percent, list_first
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability, join_names
-from egvs.results.levels import MIN_NOTICED_LEAD, DetectionRange, found_text
+from egvs.results.levels import MIN_NOTICED_LEAD, NO_DETECTORS, NOT_MEASURED, DetectionLevel
 from egvs.results.ranking import CLOSE_SHARE, RankedSite, Ranking
 from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
@@ -27,10 +27,12 @@ COMPARED_SITES = 3
 """Number of best sites that :func:`ranking_disagreement` compares."""
 
 RHO_RANGE = (
-    "{:.2f} to {:.2f}, depending on junction and detector; among sites of equal height, {:.2f} to {:.2f}".format(
-        *STUDY.larger_study.rho, *STUDY.larger_study.rho_at_equal_height
+    "{:.2f} to {:.2f}, depending on junction and detector; among sites of equal height, {:.2f} to {:.2f} (before the "
+    "models were corrected for streets; after it {:.2f} to {:.2f} at {} of the 6 junctions)".format(
+        *STUDY.larger_study.rho, *STUDY.larger_study.rho_at_equal_height, *STUDY.street_levels.rho_in_larger_study,
+        STUDY.street_levels.junctions_of_larger_study,
     )
-)
+)  # fmt: skip
 """Rank correlation of the recommended score with detection, over the held-out junctions and the detectors of the larger
 study (docs/validity.md)."""
 
@@ -40,39 +42,37 @@ FROM_SENSOR_NOTE = (
 )
 
 
-def level(site: RankedSite, detectors: Sequence[str], found: DetectionRange | None = None) -> str:
+def level(site: RankedSite, found: DetectionLevel) -> str:
     """Return what a site achieves: what detectors should find and, beside it, what people would notice.
 
     Parameters
     ----------
     site
         The site.
-    detectors
-        Detectors that the score that ranks averages over; empty for a score without detectors.
     found
-        The range that is stated instead of what detectors should find, where a number would not be supported.
+        What is known of the share that detectors find; without detectors for a score that has none.
 
     Returns
     -------
     str
-        E.g. "detectors (cluster, pointpillars) should find 84 ± 5 % of vehicles; people would notice 90 ± 2 % in its
-        sweeps". For a score without detectors it begins with a verb: "sees 60.0 % of vehicles well".
+        E.g. "detectors (cluster, pointpillars) should find 84 ± 6 % of vehicles; people would notice 90 ± 10 % in its
+        sweeps (curves of one junction)". For a score without detectors it begins with a verb: "sees 60.0 % of vehicles
+        well".
     """
-    text = site.by.sentence(site.score)
+    detectors = found.detectors
     if not detectors:
-        return text
-    if found is not None:
-        outside = format_percent(found.outside, 0)
-        measured = " or ".join(found.measured)
-        text = f"{site.by.says.format(found.text)} (nothing is known of the {outside} that are not {measured})"
+        return site.by.sentence(site.score)
+    names = f"detectors ({', '.join(detectors)})" if len(detectors) > 1 else f"the detector {detectors[0]}"
+    if found.is_measured:
+        text = f"{names} {site.by.says.format(found.text(site.score, site.score_se))}"
+        if found.range is not None:
+            outside = format_percent(found.range.outside, 0)
+            text += f" (nothing is known of the {outside} that are not {' or '.join(found.range.measured)})"
     else:
-        text = site.by.says.format(found_text(site.score, detectors, site.score_se))
-    if len(detectors) > 1:
-        text = f"detectors ({', '.join(detectors)}) {text}"
-    else:
-        text = f"the detector {detectors[0]} {text}"
+        without = "" if found.has_losses else " without losses of returns"
+        text = f"{NOT_MEASURED} for {names}{without}"
     if site.noticed is not None:
-        text += f"; people would notice {site.noticed.text} in its sweeps"
+        text += f"; people would notice {site.noticed.text} in its sweeps (curves of one junction)"
     return text
 
 
@@ -91,10 +91,9 @@ def noticed_preference(ranking: Ranking) -> str:
     )
 
 
-def headline(
-    ranking: Ranking, has_traffic: bool, detectors: Sequence[str] = (), found: DetectionRange | None = None
-) -> str:
-    """Return the result in one sentence; ``detectors`` and ``found`` as for :func:`level`."""
+def headline(ranking: Ranking, has_traffic: bool, found: DetectionLevel = NO_DETECTORS) -> str:
+    """Return the result in one sentence; ``found`` as for :func:`level`."""
+    detectors = found.detectors
     best, count = ranking.best, len(ranking.sites)
     top = best[0]
     if not has_traffic:
@@ -103,7 +102,7 @@ def headline(
         return "No site sees any of the traffic" if count > 1 else f"{top.site} sees none of the traffic"
 
     by_egvs = top.rank_by == "egvs"
-    result = level(top, detectors, found)
+    result = level(top, found)
     if by_egvs:
         result = f"sees {format_percent(top.entropy_seen)} of the traffic’s uncertainty"
     of_first = f"; from {top.site}, {result}" if detectors else f": {top.site} {result}"

@@ -26,12 +26,17 @@ _SEEDS_NOTE_OF_DETECTORS = (
 )
 _SIZE_NOTE = (
     "The order of sites by this score was validated better than its size: on simulated streets, the shares found "
-    "differed from the expected ones by {:g} percentage points (root mean square), which the error in the answer "
-    "contains, and for a detector without a model by {:g} (docs/validity.md)."
+    "differed from the expected ones by {} to {} percentage points by street (root mean square), {} for larger "
+    "vehicles; the error in the answer contains that. For a detector without a model it was {} to {} "
+    "(docs/validity.md)."
+)
+_NO_SIZE_NOTE = (
+    "The order of sites by this score was validated better than its size: the share found was not measured on "
+    "simulated streets. For a detector without a model, it was off by {} to {} percentage points (docs/validity.md)."
 )
 _NOTICED_NOTE = (
     "Found: a box overlaps the vehicle by more than 0.7 (IoU); noticed: people label it within 3 m, by curves from one "
-    "junction; its ± contains their errors, not how far other places, sensors and people differ (docs/certainty.md)."
+    "junction. Its ± is at least 10 points, by which they were off at another junction (docs/certainty.md)."
 )
 _COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = (
@@ -92,9 +97,12 @@ def describe_reliability(
 def _size_note(detectors: Sequence[str]) -> str:
     """Return how far the size of the score was validated."""
     levels = STUDY.street_levels
-    measured = [levels.error_points[name] for name in detectors if name in levels.error_points]
-    points = max(measured or levels.error_points.values())
-    return _SIZE_NOTE.format(points, levels.other_detector_error_points)
+    measured = [name for name in detectors if name in levels.error_points]
+    if not measured:
+        return _NO_SIZE_NOTE.format(*levels.other_detector_error_points)
+    by_street = [points for name in measured for points in levels.street_error_points[name]]
+    larger = max(levels.error_points[name]["larger vehicles"] for name in measured)
+    return _SIZE_NOTE.format(min(by_street), max(by_street), f"{larger:g}", *levels.other_detector_error_points)
 
 
 def _error_note(seeds: int, traffic: str, detectors: Sequence[str]) -> str:

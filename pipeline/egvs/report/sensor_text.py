@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from egvs.core.wording import by_number
 from egvs.results.labels import SCORE_LABELS, join_names
-from egvs.results.levels import MIN_NOTICED_LEAD
+from egvs.results.levels import MIN_NOTICED_LEAD, DetectionLevel, GroupLevel
 from egvs.results.sensors import SensorComparison, difference_unit
 from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
@@ -16,12 +16,13 @@ from egvs.sensors.sensor import scenario_sensor
 
 SENSOR_EVIDENCE = (
     "How far to trust this: in simulation without losses of returns, at six held-out junctions with twelve sensors, "
-    "the mean of cluster and pointpillars ranked sites nearly as three detectors do (rank correlation {rho[0]:.2f} to "
-    "{rho[1]:.2f}). But the first of a ranking lost up to {loss_points} points of AP, and {largest_loss_points} once; "
+    "the mean of cluster and pointpillars, before their correction for streets, ranked sites nearly as three detectors "
+    "do (rank correlation {rho[0]:.2f} to {rho[1]:.2f}; after it {corrected[0]:.2f} to {corrected[1]:.2f} at three of "
+    "the six). But the first of a ranking lost up to {loss_points} points of AP, and {largest_loss_points} once; "
     "shares found with {underrated_sensors[0]} and {underrated_sensors[1]} are {underrated_points[0]} to "
     "{underrated_points[1]} points higher than expected. Do not decide between sensors by less than about 10 points, "
     "nor by the cost of one more point. See docs/validity.md."
-).format(**dict(STUDY.larger_study))
+).format(**dict(STUDY.larger_study), corrected=STUDY.street_levels.rho_in_larger_study)
 """What is known about rankings of sensors by the recommended score (docs/validity.md)."""
 
 _NO_EVIDENCE = (
@@ -87,6 +88,25 @@ def has_losses(scenario: Scenario, sensors: Iterable[str]) -> bool:
     return not sensors_without_losses(scenario, sensors)
 
 
+def detection_level(
+    scenario: Scenario, detectors: Sequence[str], sensor: str, groups: Sequence[GroupLevel]
+) -> DetectionLevel:
+    """Return what is known of the share that detectors find from a site.
+
+    Parameters
+    ----------
+    scenario
+        The scenario of the run.
+    detectors
+        The detectors that the share is the mean over.
+    sensor
+        The sensor of the site.
+    groups
+        The groups of road users, from :func:`egvs.results.levels.read_levels`.
+    """
+    return DetectionLevel(tuple(detectors), tuple(groups), has_losses(scenario, [sensor]))
+
+
 def upper_limit_note(scenario: Scenario, sensors: Iterable[str]) -> str:
     """Return a sentence if what people would notice is an upper limit, as sensors lose no returns; else empty.
 
@@ -105,7 +125,8 @@ def upper_limit_note(scenario: Scenario, sensors: Iterable[str]) -> str:
         reason = f"{by_number(len(names), 'it has', 'they have')} no rated range"
     return (
         f"Losses of returns are not simulated for {join_names(names)} ({reason}), but the curves of what people notice "
-        "are for points with losses: read that share as an upper limit."
+        "are for points with losses: read that share as an upper limit. The level of corrected detectors is unknown "
+        "without losses, too."
     )
 
 

@@ -40,6 +40,8 @@ class FirstStudy(_Results):
 class LargerStudy(_Results):
     """Results of the recommended score at the held-out junctions of the larger study, and what the sensors were.
 
+    They are of the models before their correction for streets, without losses of returns.
+
     Attributes
     ----------
     rho, rho_at_equal_height
@@ -77,16 +79,24 @@ class StreetLevels(_Results):
     Attributes
     ----------
     error_points
-        By the model of a detector: root mean square error of the share of vehicles found, of the better half of the
-        sites, over all streets; in percentage points, rounded up.
+        By the model of a detector, then by group of road users and for all: root mean square error of the share found,
+        of the better half of the sites, over all streets; in percentage points, rounded up.
+    street_error_points
+        By the model of a detector: the smallest and the largest such error of a single street, for all road users.
     other_detector_error_points
         The same for a detector without a model, compared with the mean of the models.
+    rho_in_larger_study, junctions_of_larger_study
+        Lowest and highest rank correlation of the corrected models with AP at held-out junctions of the larger study,
+        over detectors, and how many of these junctions were computed again.
     groups
         By the model of a detector, the groups of road users at which the level was measured and is near enough.
     """
 
-    error_points: dict[str, float]
-    other_detector_error_points: float
+    error_points: dict[str, dict[str, float]]
+    street_error_points: dict[str, tuple[int, int]]
+    other_detector_error_points: tuple[int, int]
+    rho_in_larger_study: tuple[float, float]
+    junctions_of_larger_study: int
     groups: dict[str, tuple[str, ...]]
 
 

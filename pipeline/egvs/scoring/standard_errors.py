@@ -49,8 +49,8 @@ k-th independent value is larger by its standard error,
 
 .. math:: se^2 = se_{traffic}^2 + \sum_k (S_k - S)^2
 
-and for the difference of two sites the same with the differences. The degrees of freedom of these errors are taken as
-infinite.
+and for the difference of two sites the same with the differences. All values come from the same sweeps, so this part
+has the degrees of freedom :data:`CURVE_FREEDOM` in Satterthwaite's formula.
 
 Voxels that have equal counts in every group share one class (0.5 million occupied voxels of a real junction make 50,000
 classes), so a site costs one pass over the voxels and one over the classes. Nothing is random; the result does not
@@ -90,6 +90,9 @@ from egvs.statistics.ranks import rank_order
 
 CONFIDENCE_LEVEL = 0.9
 """Confidence of intervals."""
+
+CURVE_FREEDOM = 10.0
+"""Degrees of freedom of the errors of curves: 2,110 pairs of sweeps at 10 Hz are 11 blocks of 20 s, less one."""
 
 _CLASS_KEY_SEED = 0x9E3779B97F4A7C15
 """Seed of the keys that distinguish classes: a constant, so that equal files give equal bytes."""
@@ -577,7 +580,9 @@ class ScoreUncertainty:
             variance = stratum.variance(a, b)
             denominator += variance**2 / (len(stratum.pseudo) - 1.0)
             total += variance
-        total += _sum_of_variances(curves, a, b)
+        of_curves = _sum_of_variances(curves, a, b)
+        denominator += of_curves**2 / CURVE_FREEDOM
+        total += of_curves
         np.divide(total**2, denominator, out=freedoms, where=denominator > 0.0)
         return freedoms
 
