@@ -1,12 +1,13 @@
 """Unpack ZIP archives of map files, such as zipped Shapefiles and tiles, and KMZ files.
 
 Another process (:mod:`egvs.formats.reader_process`) unpacks the members; this one writes them to a temporary folder
-that is named like the archive. Members whose names lead out of it, links and encrypted members are errors; archives
-inside of archives stay packed. Messages name the archive and the member, never the temporary folder.
+that is named like the archive. Members whose names lead out of it, links, encrypted members and two members of one
+name are errors; archives inside of archives stay packed. Messages name the archive and the member, never the temporary folder.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import zipfile
@@ -25,6 +26,10 @@ SUFFIX = ".zip"
 MAX_MEMBERS = 10_000
 """Largest number of files in an archive."""
 
+MAX_NAME_LENGTH = 1000
+"""Largest number of characters of the path of a file in an archive."""
+
+_NAME_ERRNOS = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL)
 _CHUNK_BYTES = 1 << 20
 _CANNOT_READ = "cannot be read as a ZIP archive"
 _UNPACK_HINT = "Unpack it, and give the file or the folder."
@@ -70,7 +75,8 @@ def unpack_archives(paths: Sequence[Path], suffixes: Sequence[str] = (SUFFIX,)) 
     Raises
     ------
     InputError
-        When an archive is damaged or encrypted, has members that lead out of it, or too many or too large ones.
+        When an archive is damaged or encrypted, has members that lead out of it or of one name, or too many or too
+        large ones.
     """
     unpacked = UnpackedFiles()
     with ExitStack() as stack:
@@ -91,12 +97,25 @@ def _unpack(path: Path, folder: Path) -> None:
     limits.checked_size(path, limits.FILE)
     size = 0
     for block in read_blocks(__name__, path, os.fspath(path), _CANNOT_READ):
-        target = folder.joinpath(*_parts(block.values["name"], path))
+        name = block.values["name"]
         size += len(block.content)
         limits.UNPACKED.check_bytes(path, size)
-        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            _append(folder.joinpath(*_parts(name, path)), block.content)
+        except OSError as error:
+            if error.errno not in _NAME_ERRNOS:
+                raise
+            raise _name_error(path, name, f"cannot be unpacked ({error.strerror})") from None
+
+
+def _append(target: Path, content: bytes | memoryview) -> None:
+    """Create a file, for its first block, which is empty, or add another block to it."""
+    if content:
         with target.open("ab") as file:
-            file.write(block.content)
+            file.write(content)
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.touch(exist_ok=False)  # where case does not count, two members may have one name only here
 
 
 def _parts(name: str, path: Path) -> tuple[str, ...]:
@@ -105,7 +124,21 @@ def _parts(name: str, path: Path) -> tuple[str, ...]:
     if not parts or ".." in parts or name.startswith("/") or any(mark in name for mark in "\\:\0"):
         problem = f"its member {name[:80]!r} leads out of the archive"
         raise InputError(path, problem, "Make the archive again, with relative paths.")
+    if len(name) > MAX_NAME_LENGTH:
+        raise _name_error(path, name, f"has a name of {len(name):,} characters; at most {MAX_NAME_LENGTH} are read")
     return parts
+
+
+def _name_error(path: Path, name: str, problem: str) -> InputError:
+    return InputError(path, f"its member {name[:80]!r} {problem}", "Make the archive again, with other names.")
+
+
+def _check_distinct(names: dict[tuple[str, ...], str], path: Path) -> None:
+    """Check that no member is a folder of another one; names by their parts."""
+    for parts, name in names.items():
+        for end in range(1, len(parts)):
+            if parts[:end] in names:
+                raise _name_error(path, name, f"is in a folder that has the name of the file {names[parts[:end]]!r}")
 
 
 # --- in the other process ---
@@ -120,14 +153,23 @@ def _read_file(path: Path) -> Iterator[Block]:
             raise InputError(path, problem, "Make an archive of the files around the junction.")
         declared = sum(member.file_size for member in members)
         limits.UNPACKED.check_bytes(path, declared, f"has {declared / limits.MB:,.0f} MB after decompression")
+        names: dict[tuple[str, ...], str] = {}
+        read = []
         for member in members:
             if member.flag_bits & 1:
                 raise InputError(path, f"its member {member.filename[:80]!r} is encrypted", _UNPACK_HINT)
             if stat.S_ISLNK(member.external_attr >> 16):
                 raise InputError(path, f"its member {member.filename[:80]!r} is a link", _UNPACK_HINT)
             parts = _parts(member.filename, path)
-            if parts[0] not in _IGNORED and not parts[-1].startswith("."):
-                yield from _read_member(archive, member)
+            if parts[0] in _IGNORED or parts[-1].startswith("."):
+                continue
+            if parts in names:
+                raise _name_error(path, member.filename, "is there twice")
+            names[parts] = member.filename
+            read.append(member)
+        _check_distinct(names, path)
+        for member in read:
+            yield from _read_member(archive, member)
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Iterator[Block]:
