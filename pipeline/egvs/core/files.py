@@ -27,7 +27,7 @@ DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk or an exhausted quota."""
 
 RUN_RECORD, RUN_LOCK = "run.json", ".lock"
-"""Names of files that every run folder has."""
+"""Names of files in a run folder; the record is written at the end of the first stage."""
 
 _TEMP_PREFIX, _MAX_ATTEMPTS = "egvs-work-", 10
 
@@ -240,15 +240,13 @@ def check_no_link(path: Path) -> None:
     """
     link = None
     for folder in path.absolute().parents:
+        if (folder / RUN_RECORD).is_file() and link is not None:
+            problem = "expected a folder of the run, got a symbolic link, through which nothing is written"
+            raise InputError(link, problem, "Remove the link, or choose another folder.")
         if (folder / RUN_RECORD).is_file() or (folder / RUN_LOCK).is_file():
-            break
+            return  # the lock alone: of a first run, or of another program
         if folder.is_symlink():
             link = folder
-    else:
-        return
-    if link is not None:
-        problem = "expected a folder of the run, got a symbolic link, through which nothing is written"
-        raise InputError(link, problem, "Remove the link, or choose another folder.")
 
 
 def remove_folder(folder: Path) -> None:
