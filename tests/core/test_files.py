@@ -106,7 +106,9 @@ def test_nothing_is_written_through_linked_folders_of_a_run(tmp_path: Path) -> N
     (run / "maps" / "csv").symlink_to(elsewhere / "csv")
     for path in (run / "export" / "a.csv", run / "export" / "csv" / "a.csv", run / "maps" / "csv" / "new" / "a.csv"):
         for write in (lambda path: files.write_text(path, "x"), files.check_writable, files.ensure_writable_folder):
-            with pytest.raises(InputError, match=r"run/(export|maps/csv): expected a folder of the run, got a symbolic"):
+            with pytest.raises(
+                InputError, match=r"run/(export|maps/csv): expected a folder of the run, got a symbolic"
+            ):
                 write(path)
     assert [path.name for path in elsewhere.rglob("*")] == ["csv"]
 

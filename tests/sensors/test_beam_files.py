@@ -265,7 +265,7 @@ def test_warns_about_few_beams(mini: Path, text: str, settings: tuple[str, ...],
     file.write_text(file.read_text(encoding="utf-8").replace(rings, 'beams = "beams.csv"\n'), encoding="utf-8")
     scenario = egvs.load(mini, list(settings))
     inputs = CheckInputs(scenario, sites=sites.candidate_sites(scenario))
-    found = list(scene_checks.warn_few_beams(inputs))
+    found = list(scene_checks.warn_odd_beams(inputs))
     assert bool(found) == warns
     if warns:
         assert found[0].where == "beams.csv"

@@ -2,7 +2,8 @@
 
 Another process (:mod:`egvs.formats.reader_process`) unpacks the members; this one writes them to a temporary folder
 that is named like the archive. Members whose names lead out of it, links, encrypted members and two members of one
-name are errors; archives inside of archives stay packed. Messages name the archive and the member, never the temporary folder.
+name are errors; archives inside of archives stay packed. Messages name the archive and the member, never the temporary
+folder.
 """
 
 from __future__ import annotations

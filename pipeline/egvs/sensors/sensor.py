@@ -69,6 +69,39 @@ def describe_few_beams(sensor: Sensor) -> str | None:
     return f"{sensor.name} has {sensor.pulses:,} beams in a turn or frame; a LiDAR has thousands"
 
 
+def describe_odd_angles(sensor: Sensor) -> tuple[str, str] | None:
+    """Return a problem and a hint if the angles of a sensor look swapped, or as if in radians; None otherwise.
+
+    Azimuth offsets of rings are small; elevations reach over the field of view. A field of view that is narrower than
+    pi / 2 degrees has few rings.
+    """
+    elevations_deg = np.unique(sensor.beam_table.elevation_deg)
+    span_deg = float(np.ptp(elevations_deg))
+    if len(elevations_deg) >= MIN_RINGS and span_deg <= MAX_RADIANS and np.abs(elevations_deg).max() <= MAX_RADIANS:
+        problem = (
+            f"{len(elevations_deg)} elevations of {sensor.name} are within {span_deg:.2g} degrees, from"
+            f" {elevations_deg[0]:.4g} to {elevations_deg[-1]:.4g}: they look like radians"
+        )
+        return problem, "Convert them to degrees."
+    offsets_deg = [] if sensor.table is not None else sorted(set(sensor.azimuth_offsets_deg))
+    if not offsets_deg or len(sensor.elevations_deg) < MIN_RINGS or 2 * len(offsets_deg) <= len(sensor.elevations_deg):
+        return None
+    offset_span_deg = offsets_deg[-1] - offsets_deg[0]
+    if offset_span_deg >= max(MIN_SWAPPED_DEG, 2.0 * span_deg) and offset_span_deg <= 180.0:
+        problem = (
+            f"the azimuth offsets of {sensor.name} extend over {offset_span_deg:.3g} degrees, its elevations over"
+            f" {span_deg:.3g}: they look swapped"
+        )
+        return problem, "Swap the headings of the two columns, or the columns if they have none."
+    return None
+
+
+MIN_RINGS = 16
+"""With fewer rings, a narrow field of view is usual."""
+MAX_RADIANS = math.pi / 2.0
+MIN_SWAPPED_DEG = 16.0
+"""Azimuth offsets of LiDARs extend over less; 15.6 degrees are the most in the catalogue."""
+
 FEW_BEAMS_HINT = (
     "If each row of its file is a ring, name the column azimuth_offset_deg instead of azimuth_deg and set"
     " azimuth_step_deg; egvs sensors FILE prints what is read."
