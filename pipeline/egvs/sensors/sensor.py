@@ -25,7 +25,7 @@ from __future__ import annotations
 import difflib
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -69,27 +69,38 @@ def describe_few_beams(sensor: Sensor) -> str | None:
     return f"{sensor.name} has {sensor.pulses:,} beams in a turn or frame; a LiDAR has thousands"
 
 
-def describe_odd_angles(sensor: Sensor) -> tuple[str, str] | None:
+def describe_odd_angles(
+    name: str, elevations_deg: Sequence[float] | FloatArray, offsets_deg: Sequence[float] = ()
+) -> tuple[str, str] | None:
     """Return a problem and a hint if the angles of a sensor look swapped, or as if in radians; None otherwise.
 
     Azimuth offsets of rings are small; elevations reach over the field of view. A field of view that is narrower than
     pi / 2 degrees has few rings.
+
+    Parameters
+    ----------
+    name
+        The sensor, or its file, for the problem.
+    elevations_deg
+        Of all rings or beams.
+    offsets_deg
+        Azimuth offsets of all rings; empty for single beams.
     """
-    elevations_deg = np.unique(sensor.beam_table.elevation_deg)
-    span_deg = float(np.ptp(elevations_deg))
-    if len(elevations_deg) >= MIN_RINGS and span_deg <= MAX_RADIANS and np.abs(elevations_deg).max() <= MAX_RADIANS:
+    distinct_deg = np.unique(elevations_deg)
+    span_deg = float(np.ptp(distinct_deg))
+    if len(distinct_deg) >= MIN_RINGS and span_deg <= MAX_RADIANS and np.abs(distinct_deg).max() <= MAX_RADIANS:
         problem = (
-            f"{len(elevations_deg)} elevations of {sensor.name} are within {span_deg:.2g} degrees, from"
-            f" {elevations_deg[0]:.4g} to {elevations_deg[-1]:.4g}: they look like radians"
+            f"{len(distinct_deg)} elevations of {name} are within {span_deg:.2g} degrees, from"
+            f" {distinct_deg[0]:.4g} to {distinct_deg[-1]:.4g}: they look like radians"
         )
         return problem, "Convert them to degrees."
-    offsets_deg = [] if sensor.table is not None else sorted(set(sensor.azimuth_offsets_deg))
-    if not offsets_deg or len(sensor.elevations_deg) < MIN_RINGS or 2 * len(offsets_deg) <= len(sensor.elevations_deg):
+    distinct_offsets_deg = np.unique(offsets_deg)
+    if len(offsets_deg) < MIN_RINGS or 2 * len(distinct_offsets_deg) <= len(offsets_deg):
         return None
-    offset_span_deg = offsets_deg[-1] - offsets_deg[0]
+    offset_span_deg = float(np.ptp(distinct_offsets_deg))
     if offset_span_deg >= max(MIN_SWAPPED_DEG, 2.0 * span_deg) and offset_span_deg <= 180.0:
         problem = (
-            f"the azimuth offsets of {sensor.name} extend over {offset_span_deg:.3g} degrees, its elevations over"
+            f"the azimuth offsets of {name} extend over {offset_span_deg:.3g} degrees, its elevations over"
             f" {span_deg:.3g}: they look swapped"
         )
         return problem, "Swap the headings of the two columns, or the columns if they have none."

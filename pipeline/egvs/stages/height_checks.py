@@ -324,8 +324,7 @@ def _warn_tall_solids(inputs: CheckInputs, extents: _Extents) -> Iterator[Diagno
     """Warn for each file with a solid higher than any building, or near the region only with solids like towers."""
     assert inputs.world is not None
     near_low_m, near_high_m = _near_region_m(inputs)
-    is_near: NDArray[np.bool_] = (extents.low_m[:, :2] <= near_high_m).all(axis=1)
-    is_near &= (extents.high_m[:, :2] >= near_low_m).all(axis=1)
+    is_near = np.all((extents.low_m[:, :2] <= near_high_m) & (extents.high_m[:, :2] >= near_low_m), axis=1)
     height_m = extents.high_m[:, 2] - extents.low_m[:, 2]
     for source in inputs.solid_sources:
         solids = np.arange(source.first, source.end)

@@ -151,7 +151,8 @@ def warn_odd_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
         few = sensor.describe_few_beams(custom)
         if few is not None:
             yield Diagnostic("few beams", where, few, sensor.FEW_BEAMS_HINT)
-        odd = sensor.describe_odd_angles(custom)
+        offsets_deg = custom.azimuth_offsets_deg if custom.table is None else ()
+        odd = sensor.describe_odd_angles(name, custom.beam_table.elevation_deg, offsets_deg)
         if odd is not None:
             yield Diagnostic("beam angles", where, *odd)
 
