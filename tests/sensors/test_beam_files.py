@@ -272,16 +272,16 @@ def test_warns_about_few_beams(mini: Path, text: str, settings: tuple[str, ...],
         assert "a LiDAR has thousands" in found[0].problem
 
 
-HESAI = "Laser id,Elevation,Azimuth\n"
-SWAPPED = "Laser id,Azimuth,Elevation\n"
+HESAI_HEADER = "Laser id,Elevation,Azimuth\n"
+SWAPPED_HEADER = "Laser id,Azimuth,Elevation\n"
 
 
 @pytest.mark.parametrize(
     ("name", "header", "scale", "words"),
     [
-        ("a.csv", HESAI, 1.0, None),
-        ("a.csv", SWAPPED, 1.0, "they look swapped"),
-        ("a.csv", HESAI, math.pi / 180, "they look like radians"),
+        ("a.csv", HESAI_HEADER, 1.0, None),
+        ("a.csv", SWAPPED_HEADER, 1.0, "they look swapped"),
+        ("a.csv", HESAI_HEADER, math.pi / 180, "they look like radians"),
         ("a.csv", "", 1.0, None),
         ("a.csv", "", math.pi / 180, "they look like radians"),
         ("a.json", "", 1.0, None),
