@@ -95,3 +95,43 @@ def test_temporary_folders_work_without_file_locks(monkeypatch: pytest.MonkeyPat
     with files.temporary_folder() as folder:
         assert folder.is_dir()
     assert not folder.exists()
+
+
+def test_nothing_is_written_through_linked_folders_of_a_run(tmp_path: Path) -> None:
+    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    (elsewhere / "csv").mkdir(parents=True)
+    (run / "maps").mkdir(parents=True)
+    (run / files.RUN_RECORD).write_text("")
+    (run / "export").symlink_to(elsewhere)
+    (run / "maps" / "csv").symlink_to(elsewhere / "csv")
+    for path in (run / "export" / "a.csv", run / "export" / "csv" / "a.csv", run / "maps" / "csv" / "new" / "a.csv"):
+        for write in (lambda path: files.write_text(path, "x"), files.check_writable, files.ensure_writable_folder):
+            with pytest.raises(
+                InputError, match=r"run/(export|maps/csv): expected a folder of the run, got a symbolic"
+            ):
+                write(path)
+    assert [path.name for path in elsewhere.rglob("*")] == ["csv"]
+
+
+def test_run_folders_may_be_links(tmp_path: Path) -> None:
+    (tmp_path / "disk" / "run").mkdir(parents=True)
+    (tmp_path / "runs").symlink_to(tmp_path / "disk")
+    (tmp_path / "last").symlink_to(tmp_path / "disk" / "run")
+    (tmp_path / files.RUN_RECORD).write_text("")  # of a run in the folder of the scenario
+    (tmp_path / "disk" / "run" / files.RUN_RECORD).write_text("")
+    for run in (tmp_path / "runs" / "run", tmp_path / "last"):
+        files.write_text(run / "export" / "a.csv", "x")
+    (tmp_path / files.RUN_RECORD).unlink()
+    files.write_text(tmp_path / "runs" / "maps" / "a.csv", "x")
+
+
+def test_removing_a_link_keeps_what_it_leads_to(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "b").write_text("x")
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    files.remove_folder(tmp_path / "link")
+    assert not (tmp_path / "link").exists()
+    assert (tmp_path / "a" / "b").exists()
+    files.remove_folder(tmp_path / "a")
+    files.remove_folder(tmp_path / "a")
+    assert not (tmp_path / "a").exists()

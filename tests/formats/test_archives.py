@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import stat
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -178,3 +179,24 @@ def test_zipped_shapefile(tmp_path: Path) -> None:
     del parts["h.prj"]
     with pytest.raises(InputError, match=r"h2\.zip/h\.shp: the file does not declare .* Add h\.prj"):
         vector_files.read_gis_file(write_zip(tmp_path / "h2.zip", parts), "Polygon")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("a.csv", "a.csv"), ("a.csv", "./a.csv"), ("a", "a/b.csv"), ("a/b.csv", "a"), ("x" * 300,), ("d/" * 2500 + "b",)],
+)
+def test_members_that_cannot_be_files_are_named(tmp_path: Path, names: tuple[str, ...]) -> None:
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # zipfile warns of names that it has written before
+        for name in names:
+            archive.writestr(name, "x")
+    with pytest.raises(InputError, match=r"a\.zip: its member '[^']+'") as error, unpack_archives([path]):
+        pass
+    assert "egvs-work" not in str(error.value)
+
+
+def test_deep_folders_are_unpacked(tmp_path: Path) -> None:
+    path = write_zip(tmp_path / "a.zip", {"d/" * 400 + "b.csv": "x"})
+    with unpack_archives([path]) as unpacked:
+        assert [file.name for file in unpacked.paths[0].rglob("*.csv")] == ["b.csv"]

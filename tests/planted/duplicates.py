@@ -164,6 +164,13 @@ DUPLICATES = (
         "differ only in the Unicode of accents",
     ),
     Case(
+        "site with an invisible character in its name",
+        street,
+        text("sites.csv", "pole_b", "pole\u200b_a"),
+        "sites.csv",
+        "in invisible characters",
+    ),
+    Case(
         "same sensor under two names",
         street,
         file("sites.csv", lambda s: scenes.sites([(name, s.truth.mounts[0][1]) for name in ("pole_a", "pole_b")])),

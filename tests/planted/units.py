@@ -28,6 +28,9 @@ NARROW = replace(
 )
 """A sensor with a narrow field of view, that looks south across the street."""
 
+MANY_RINGS = replace(STREET, elevations_deg=tuple(range(-20, 12, 2)), azimuths_deg=tuple(range(0, 360, 6)))
+RADIANS = replace(MANY_RINGS, elevations_deg=tuple(math.radians(angle) for angle in MANY_RINGS.elevations_deg))
+
 TILTED = replace(NARROW, elevations_deg=(-4.0, 0.0, 4.0), mounts=(("mast", Mount(20.3, 20.2, 14.1, -90.0, -35.0)),))
 """The same on a high mast, that looks down."""
 
@@ -243,6 +246,29 @@ UNITS = (
         site_names(yaw_deg="heading_deg"),
         "sites.csv",
         "counter-clockwise from east",
+    ),
+    Case(
+        "column of pans",
+        street,
+        site_names(yaw_deg="Pan"),
+        "sites.csv",
+        "counter-clockwise from east",
+    ),
+    Case(
+        "sensor that points up",
+        street,
+        mounts(lambda mount: replace(mount, pitch_deg=60.0)),
+        "sites",
+        "point more than 30 degrees up",
+        is_error=False,
+    ),
+    Case(
+        "elevations in radians",
+        make(truth=MANY_RINGS),
+        key("sensors.small", scenes.sensor(RADIANS)),
+        "sensors.small",
+        "they look like radians",
+        is_error=False,
     ),
     Case(
         "column of downward tilts",

@@ -24,7 +24,7 @@ from egvs.scoring.scorer import Scorer
 from egvs.sensors import sites
 from egvs.sensors.beam_files import BeamTable, Rings, read_beam_file, read_directions
 from egvs.sensors.scanner import Scanner
-from egvs.sensors.sensor import Sensor, resolve_sensor, scenario_sensor
+from egvs.sensors.sensor import Sensor, catalogue_entries, describe_odd_angles, resolve_sensor, scenario_sensor
 from egvs.sensors.sites import Pose
 from egvs.stages import scene_checks
 from egvs.stages.inputs import CheckInputs
@@ -265,11 +265,56 @@ def test_warns_about_few_beams(mini: Path, text: str, settings: tuple[str, ...],
     file.write_text(file.read_text(encoding="utf-8").replace(rings, 'beams = "beams.csv"\n'), encoding="utf-8")
     scenario = egvs.load(mini, list(settings))
     inputs = CheckInputs(scenario, sites=sites.candidate_sites(scenario))
-    found = list(scene_checks.warn_few_beams(inputs))
+    found = list(scene_checks.warn_odd_beams(inputs))
     assert bool(found) == warns
     if warns:
         assert found[0].where == "beams.csv"
         assert "a LiDAR has thousands" in found[0].problem
+
+
+HESAI_HEADER = "Laser id,Elevation,Azimuth\n"
+SWAPPED_HEADER = "Laser id,Azimuth,Elevation\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "header", "scale", "words"),
+    [
+        ("a.csv", HESAI_HEADER, 1.0, None),
+        ("a.csv", SWAPPED_HEADER, 1.0, "they look swapped"),
+        ("a.csv", HESAI_HEADER, math.pi / 180, "they look like radians"),
+        ("a.csv", "", 1.0, None),
+        ("a.csv", "", math.pi / 180, "they look like radians"),
+        ("a.json", "", 1.0, None),
+        ("a.json", "", math.pi / 180, "they look like radians"),
+    ],
+)
+def test_warns_about_swapped_columns_and_radians(
+    mini: Path, name: str, header: str, scale: float, words: str | None
+) -> None:
+    angles = [(scale * (15 - number * 40 / 31), scale * (number % 4 * 2.8 - 4.2)) for number in range(32)]
+    rows = [f"{up},{offset}" for up, offset in angles]
+    if header:
+        rows = [f"{number},{row}" for number, row in enumerate(rows, start=1)]
+    text = header + "".join(f"{row}\n" for row in rows)
+    if name.endswith("json"):
+        columns = dict(zip(("beam_altitude_angles", "beam_azimuth_angles"), zip(*angles, strict=True), strict=True))
+        text = json.dumps({**columns, "lidar_mode": "1024x10"})
+    write(mini, name, text)
+    file = mini / "scenario.toml"
+    rings = "elevations_deg = [-15, 5]\nchannels = 8\nazimuth_step_deg = 1.0\n"
+    step = "" if name.endswith("json") else "azimuth_step_deg = 1.0\n"
+    file.write_text(file.read_text(encoding="utf-8").replace(rings, f'beams = "{name}"\n{step}'), encoding="utf-8")
+    scenario = egvs.load(mini)
+    findings = list(scene_checks.warn_odd_beams(CheckInputs(scenario, sites=sites.candidate_sites(scenario))))
+    assert [finding.where for finding in findings] == ([] if words is None else [name])
+    assert words is None or words in findings[0].problem
+
+
+def test_sensors_of_the_catalogue_have_usual_angles() -> None:
+    for name in catalogue_entries():
+        model = resolve_sensor(name, {}, "sites.sensor")
+        offsets_deg = model.azimuth_offsets_deg if model.table is None else ()
+        assert describe_odd_angles(name, model.beam_table.elevation_deg, offsets_deg) is None, name
 
 
 def test_prints_what_is_read(tmp_path: Path, run_egvs: Any) -> None:

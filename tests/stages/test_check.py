@@ -303,6 +303,33 @@ def test_open_surface_above_kerb_is_in_the_way(street: Path) -> None:
             assert "1 solid covers 100.0 % of the lanes" in told["solids over lanes"][0]
 
 
+@pytest.mark.parametrize(
+    ("low_m", "high_m", "y_m", "is_found"),
+    [(0, 20, 1.5, True), (0, 1.9, 1.5, False), (4.6, 20, 1.5, False), (0, 20, 8, False), (0, 20, -1.5, True)],
+)
+def test_wall_without_an_inside_is_across_lanes(
+    street: Path, low_m: float, high_m: float, y_m: float, is_found: bool
+) -> None:
+    """As the ground of a surface with y up: a plane that stands on the road, and has no area in plan."""
+    z_m = np.linspace(low_m, high_m, 21)
+    corners = "".join(f"v {x} {y_m} {z}\n" for z in z_m for x in (5, 25))
+    faces = "".join(f"f {k} {k + 1} {k + 3}\nf {k} {k + 3} {k + 2}\n" for k in range(1, 41, 2))
+    (street / "wall.obj").write_text(corners + faces)
+    told = found(street, 'statics.meshes=[{file="wall.obj"}]')
+    lines = told.get("solids over lanes", [])
+    assert [line.startswith("[statics: walls of wall") for line in lines] == ([True] if is_found else [])
+
+
+@pytest.mark.parametrize(("pitch_deg", "is_found"), [(-60.0, False), (0.0, False), (30.0, False), (60.0, True)])
+def test_beams_of_a_site_in_the_region_reach_it_unless_all_point_up(
+    street: Path, pitch_deg: float, is_found: bool
+) -> None:
+    (street / "sites.csv").write_text(f"site,x_m,y_m,z_m,yaw_deg,pitch_deg\na,20,6,3,-90,{pitch_deg}\n")
+    sensor = "{elevations_deg=[-10,10],channels=4,azimuth_step_deg=1.0,azimuth_deg=[-20,20],range_m=100}"
+    told = found(street, f"sensors.small={sensor}", "roi.center_m=[20,0,2.5]", "roi.size_m=[40,20,5]")
+    assert ("beams beside the region" in told) == ("nose up" in told) == is_found
+
+
 def test_warns_of_distant_buildings(street: Path) -> None:
     statics(street, box((1000, 2000), (1010, 2010)), box((1100, 2000), (1110, 2010)))
     assert found(street) == {

@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import overload
 
-from egvs.core import plugins
+from egvs.core import files, plugins
 
 GROUP = "egvs.files"
 """The group of entry points."""
@@ -70,8 +70,8 @@ class RunFolder:
 
     path: Path
 
-    run_record = RunFile("run.json", "run")
-    lock = RunFile(".lock", "run")
+    run_record = RunFile(files.RUN_RECORD, "run")
+    lock = RunFile(files.RUN_LOCK, "run")
     digests = RunFile(".digests.json", "run")
     pending = RunFile(".pending", "run", is_folder=True)
 

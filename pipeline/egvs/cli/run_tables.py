@@ -408,7 +408,7 @@ def print_sensor_details(sensors: Iterable[Sensor]) -> None:
 def print_beam_file(path: Path, file: BeamFile) -> None:
     """Print what was read of a file of beams, and how a scenario uses it."""
     from egvs.sensors.beam_files import BeamTable
-    from egvs.sensors.sensor import FEW_BEAMS, FEW_BEAMS_HINT
+    from egvs.sensors.sensor import FEW_BEAMS, FEW_BEAMS_HINT, describe_odd_angles
 
     beams = file.beams
     if isinstance(beams, BeamTable):
@@ -446,6 +446,9 @@ def print_beam_file(path: Path, file: BeamFile) -> None:
     lines.append(f"  in a scenario: [sensors.NAME] with {keys}")
     if count is not None and count < FEW_BEAMS:
         lines.append(f"  warning: {count:,} beams in a turn or frame; a LiDAR has thousands. {FEW_BEAMS_HINT}")
+    odd = describe_odd_angles(path.name, elevations, () if isinstance(beams, BeamTable) else beams.azimuth_offsets_deg)
+    if odd is not None:
+        lines.append(f"  warning: {odd[0]}. {odd[1]}")
     print_sentences(lines)
 
 

@@ -26,6 +26,9 @@ from egvs.core.errors import InputError
 DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
 """Error numbers of a full disk or an exhausted quota."""
 
+RUN_RECORD, RUN_LOCK = "run.json", ".lock"
+"""Names of files in a run folder; the record is written at the end of the first stage."""
+
 _TEMP_PREFIX, _MAX_ATTEMPTS = "egvs-work-", 10
 
 _MIN_FREE_BYTES, _MIN_FREE_BYTES_AFTER_ERROR = 4096, 1_000_000
@@ -93,6 +96,7 @@ def _write_probe(folder: Path, n_bytes: int) -> None:
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a path to write to; rename it to ``path`` when the block ends well, remove it when it does not."""
+    check_no_link(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
     _check_not_folder(path)
@@ -207,6 +211,7 @@ def check_writable(path: Path) -> None:
     InputError
         When it could not be written.
     """
+    check_no_link(path)
     try:
         _check_not_folder(path)
         existing = next(folder for folder in path.parents if folder.exists())
@@ -218,6 +223,38 @@ def check_writable(path: Path) -> None:
 
 def _not_writable_error(path: Path, error: OSError) -> InputError:
     return InputError(path, f"cannot be written ({error.strerror})", "Choose a folder that you may write to.")
+
+
+def check_no_link(path: Path) -> None:
+    """Check that no folder between a run folder and a file in it is a symbolic link; the run folder may be one.
+
+    Parameters
+    ----------
+    path
+        The file, or a folder to be filled as ``path / "..."``; it need not exist, and need not be in a run folder.
+
+    Raises
+    ------
+    InputError
+        When writing the file would follow a link out of the run folder.
+    """
+    link = None
+    for folder in path.absolute().parents:
+        if (folder / RUN_RECORD).is_file() and link is not None:
+            problem = "expected a folder of the run, got a symbolic link, through which nothing is written"
+            raise InputError(link, problem, "Remove the link, or choose another folder.")
+        if (folder / RUN_RECORD).is_file() or (folder / RUN_LOCK).is_file():
+            return  # the lock alone: of a first run, or of another program
+        if folder.is_symlink():
+            link = folder
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder with all files in it, if there is one; of a symbolic link, the link."""
+    if folder.is_symlink():
+        folder.unlink()
+    elif folder.exists():
+        shutil.rmtree(folder)
 
 
 def _check_not_folder(path: Path) -> None:

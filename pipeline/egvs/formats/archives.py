@@ -1,9 +1,9 @@
 """Unpack ZIP archives of map files, such as zipped Shapefiles and tiles, and KMZ files.
 
 Another process (:mod:`egvs.formats.reader_process`) unpacks the members; this one writes them to a temporary folder
-that is named like the archive. Members whose names lead out of it, links and encrypted members are errors. ZIP archives
-inside of archives are unpacked to folders as well, up to :data:`MAX_DEPTH`. Messages name the archive and the member,
-never the temporary folder.
+that is named like the archive. Members whose names lead out of it, links, encrypted members and two members of one
+name are errors. ZIP archives inside of archives are unpacked to folders as well, up to :data:`MAX_DEPTH`. Messages name
+the archive and the member, never the temporary folder.
 
 Beside the suffix, the first bytes tell an archive: what is named ``.zip`` but is none, such as a map in plain text, is
 left to the reader of its content, and a map that is zipped under its own name is unpacked.
@@ -11,6 +11,7 @@ left to the reader of its content, and a map that is zipped under its own name i
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import zipfile
@@ -34,6 +35,10 @@ MAX_DEPTH = 3
 
 _SIGNATURES = (b"PK\x03\x04", b"PK\x05\x06")
 _OTHER_ZIP_FORMATS = (".kmz", ".xlsx", ".ods", ".npz", ".usdz")
+MAX_NAME_LENGTH = 1000
+"""Largest number of characters of the path of a file in an archive."""
+
+_NAME_ERRNOS = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL)
 _CHUNK_BYTES = 1 << 20
 _CANNOT_READ = "cannot be read as a ZIP archive"
 _UNPACK_HINT = "Unpack it, and give the file or the folder."
@@ -79,7 +84,8 @@ def unpack_archives(paths: Sequence[Path], suffixes: Sequence[str] = (SUFFIX,)) 
     Raises
     ------
     InputError
-        When an archive is damaged or encrypted, has members that lead out of it, or too many or too large ones.
+        When an archive is damaged or encrypted, has members that lead out of it or of one name, or too many or too
+        large ones.
     """
     unpacked = UnpackedFiles()
     with ExitStack() as stack:
@@ -115,12 +121,16 @@ def _unpack(path: Path, where: str, folder: Path, size: int = 0, depth: int = 1)
     limits.checked_size(path, limits.FILE, where)
     inner: dict[Path, None] = {}
     for block in read_blocks(__name__, path, where, _CANNOT_READ):
-        target = folder.joinpath(*_parts(block.values["name"], where))
+        name = block.values["name"]
         size += len(block.content)
         limits.UNPACKED.check_bytes(where, size)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with target.open("ab") as file:
-            file.write(block.content)
+        target = folder.joinpath(*_parts(name, where))
+        try:
+            _append(target, block.content)
+        except OSError as error:
+            if error.errno not in _NAME_ERRNOS:
+                raise
+            raise _name_error(where, name, f"cannot be unpacked ({error.strerror})") from None
         if target.suffix.lower() == SUFFIX:
             inner.setdefault(target)
     for archive in filter(zipfile.is_zipfile, inner):
@@ -133,13 +143,37 @@ def _unpack(path: Path, where: str, folder: Path, size: int = 0, depth: int = 1)
     return size
 
 
+def _append(target: Path, content: bytes | memoryview) -> None:
+    """Create a file, for its first block, which is empty, or add another block to it."""
+    if content:
+        with target.open("ab") as file:
+            file.write(content)
+        return
+    target.parent.mkdir(parents=True, exist_ok=True)
+    target.touch(exist_ok=False)  # where case does not count, two members may have one name only here
+
+
 def _parts(name: str, where: object) -> tuple[str, ...]:
     """Return the parts of a member's path inside its archive; InputError when it leads out of it."""
     parts = PurePosixPath(name).parts
     if not parts or ".." in parts or name.startswith("/") or any(mark in name for mark in "\\:\0"):
         problem = f"its member {name[:80]!r} leads out of the archive"
         raise InputError(where, problem, "Make the archive again, with relative paths.")
+    if len(name) > MAX_NAME_LENGTH:
+        raise _name_error(where, name, f"has a name of {len(name):,} characters; at most {MAX_NAME_LENGTH} are read")
     return parts
+
+
+def _name_error(where: object, name: str, problem: str) -> InputError:
+    return InputError(where, f"its member {name[:80]!r} {problem}", "Make the archive again, with other names.")
+
+
+def _check_distinct(names: dict[tuple[str, ...], str], path: Path) -> None:
+    """Check that no member is a folder of another one; names by their parts."""
+    for parts, name in names.items():
+        for end in range(1, len(parts)):
+            if parts[:end] in names:
+                raise _name_error(path, name, f"is in a folder that has the name of the file {names[parts[:end]]!r}")
 
 
 # --- in the other process ---
@@ -154,14 +188,23 @@ def _read_file(path: Path) -> Iterator[Block]:
             raise InputError(path, problem, "Make an archive of the files around the junction.")
         declared = sum(member.file_size for member in members)
         limits.UNPACKED.check_bytes(path, declared, f"has {declared / limits.MB:,.0f} MB after decompression")
+        names: dict[tuple[str, ...], str] = {}
+        read = []
         for member in members:
             if member.flag_bits & 1:
                 raise InputError(path, f"its member {member.filename[:80]!r} is encrypted", _UNPACK_HINT)
             if stat.S_ISLNK(member.external_attr >> 16):
                 raise InputError(path, f"its member {member.filename[:80]!r} is a link", _UNPACK_HINT)
             parts = _parts(member.filename, path)
-            if parts[0] not in _IGNORED and not parts[-1].startswith("."):
-                yield from _read_member(archive, member)
+            if parts[0] in _IGNORED or parts[-1].startswith("."):
+                continue
+            if parts in names:
+                raise _name_error(path, member.filename, "is there twice")
+            names[parts] = member.filename
+            read.append(member)
+        _check_distinct(names, path)
+        for member in read:
+            yield from _read_member(archive, member)
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Iterator[Block]:

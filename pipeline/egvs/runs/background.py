@@ -148,7 +148,10 @@ def run_in_background(
     BackgroundStage or None
         The stage; None where there is no need to run it.
     """
-    shutil.rmtree(context.folder.pending, ignore_errors=True)  # of a killed run
+    pending = context.folder.pending  # of a killed run
+    if pending.is_symlink():
+        pending.unlink()
+    shutil.rmtree(pending, ignore_errors=True)
     if key is None:
         yield None
         return

@@ -34,18 +34,24 @@ def find_duplicates(names: Sequence[Any]) -> list[Any]:
 
 
 def same_name(name: str) -> str:
-    """Return the form in which names are compared: Unicode's NFC, in which each accented letter is one character.
+    """Return the form in which names are compared: Unicode's NFC, without invisible characters.
+
+    In NFC each accented letter is one character; characters of the category Cf, such as the zero-width space, have no
+    shape of their own.
 
     Examples
     --------
     >>> same_name("e\N{COMBINING ACUTE ACCENT}") == "\N{LATIN SMALL LETTER E WITH ACUTE}"
     True
+    >>> same_name("pole\N{ZERO WIDTH SPACE} 1")
+    'pole 1'
     """
-    return unicodedata.normalize("NFC", name)
+    normal = unicodedata.normalize("NFC", name)
+    return normal if normal.isascii() else "".join(c for c in normal if unicodedata.category(c) != "Cf")
 
 
 def similar_names(names: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Yield pairs of different names that differ only in upper and lower case, or in the Unicode of accents.
+    """Yield pairs of different names that differ only in upper and lower case, accents or invisible characters.
 
     Examples
     --------

@@ -25,7 +25,7 @@ from __future__ import annotations
 import difflib
 import math
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -68,6 +68,50 @@ def describe_few_beams(sensor: Sensor) -> str | None:
         return None
     return f"{sensor.name} has {sensor.pulses:,} beams in a turn or frame; a LiDAR has thousands"
 
+
+def describe_odd_angles(
+    name: str, elevations_deg: Sequence[float] | FloatArray, offsets_deg: Sequence[float] = ()
+) -> tuple[str, str] | None:
+    """Return a problem and a hint if the angles of a sensor look swapped, or as if in radians; None otherwise.
+
+    Azimuth offsets of rings are small; elevations reach over the field of view. A field of view that is narrower than
+    pi / 2 degrees has few rings.
+
+    Parameters
+    ----------
+    name
+        The sensor, or its file, for the problem.
+    elevations_deg
+        Of all rings or beams.
+    offsets_deg
+        Azimuth offsets of all rings; empty for single beams.
+    """
+    distinct_deg = np.unique(elevations_deg)
+    span_deg = float(np.ptp(distinct_deg))
+    if len(distinct_deg) >= MIN_RINGS and span_deg <= MAX_RADIANS and np.abs(distinct_deg).max() <= MAX_RADIANS:
+        problem = (
+            f"{len(distinct_deg)} elevations of {name} are within {span_deg:.2g} degrees, from"
+            f" {distinct_deg[0]:.4g} to {distinct_deg[-1]:.4g}: they look like radians"
+        )
+        return problem, "Convert them to degrees."
+    distinct_offsets_deg = np.unique(offsets_deg)
+    if len(offsets_deg) < MIN_RINGS or 2 * len(distinct_offsets_deg) <= len(offsets_deg):
+        return None
+    offset_span_deg = float(np.ptp(distinct_offsets_deg))
+    if offset_span_deg >= max(MIN_SWAPPED_DEG, 2.0 * span_deg) and offset_span_deg <= 180.0:
+        problem = (
+            f"the azimuth offsets of {name} extend over {offset_span_deg:.3g} degrees, its elevations over"
+            f" {span_deg:.3g}: they look swapped"
+        )
+        return problem, "Swap the headings of the two columns, or the columns if they have none."
+    return None
+
+
+MIN_RINGS = 16
+"""With fewer rings, a narrow field of view is usual."""
+MAX_RADIANS = math.pi / 2.0
+MIN_SWAPPED_DEG = 16.0
+"""Azimuth offsets of LiDARs extend over less; 15.6 degrees are the most in the catalogue."""
 
 FEW_BEAMS_HINT = (
     "If each row of its file is a ring, name the column azimuth_offset_deg instead of azimuth_deg and set"

@@ -33,6 +33,7 @@ from egvs.core.reading import read_json
 from egvs.formats import spreadsheets, vector_files
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference, declared_crs, geojson_coordinates
 from egvs.formats.workbooks import MAX_COLUMNS
+from egvs.scenario.fields import same_name
 
 REQUIRED_COLUMNS = ("site", "x_m", "y_m", "z_m")
 AIM_COLUMNS = ("aim_x_m", "aim_y_m", "aim_z_m")
@@ -55,6 +56,9 @@ FOREIGN_COLUMNS = {
     **dict.fromkeys(("sensor_height", "mount_height", "mounting_height"), _Z_HINT),
     **dict.fromkeys(("heading", "bearing", "azimuth", "compass", "facing", "orientation", "direction"), _YAW_HINT),
     **dict.fromkeys(("tilt", "tilt_angle", "tilt_down", "down_tilt", "downtilt", "inclination"), _PITCH_HINT),
+    **dict.fromkeys(("höhe", "hoehe", "einbauhöhe", "montagehöhe"), _Z_HINT),
+    **dict.fromkeys(("pan", "rotation", "azimut", "blickrichtung"), _YAW_HINT),
+    **dict.fromkeys(("neigung", "neigungswinkel"), _PITCH_HINT),
     **dict.fromkeys(("lidar", "sensor_name", "sensor_model", "sensor_type"), _SENSOR_HINT),
 }
 """Columns of other programs, without their unit, and the column to use instead, with the conversion."""
@@ -326,7 +330,7 @@ def user_columns(where: str, row: Mapping[str, Any], known: Collection[str]) -> 
 
 def _check_foreign_columns(where: str, row: Mapping[str, Any]) -> None:
     for name, value in row.items():
-        key = re.sub(r"[\s-]+", "_", _COLUMN_UNIT.sub("", name.strip().lower()))
+        key = re.sub(r"[\s-]+", "_", _COLUMN_UNIT.sub("", same_name(name).strip().lower()))
         if key in FOREIGN_COLUMNS and value not in (None, ""):
             hint = f"{FOREIGN_COLUMNS[key]} A custom column needs another name."
             raise InputError(where, f"the column {name!r} has no effect", hint)

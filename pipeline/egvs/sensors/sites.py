@@ -177,7 +177,8 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
                 if site.name in sites:
                     raise InputError(row.where, f"there are two sites {site.name!r}", "Give each site its own name.")
                 if other != site.name:
-                    problem = f"the sites {other!a} and {site.name!a} differ only in the Unicode of accents"
+                    difference = "in the Unicode of accents or in invisible characters"
+                    problem = f"the sites {other!a} and {site.name!a} differ only {difference}"
                     raise InputError(row.where, problem, "Give each site its own name.")
                 sites[site.name] = site
         except InputError as error:

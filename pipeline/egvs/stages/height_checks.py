@@ -8,7 +8,9 @@ compared with those of the road beside them (of the traffic, where there is no n
   over lanes, bridges and crowns float only above :data:`MAX_ELEVATED_M`, other thin solids above :data:`MAX_BESIDE_M`.
 - Solids with the same offset as those count, too. If they are most of those that stand on the ground, the file has
   another zero, which is an error. Single ones are a warning, and so are files most of whose solids are above the road.
-- Vehicles are compared with the lanes below them, lanes with the points of the terrain, sensors with the road.
+- Vehicles are compared with the lanes below them, lanes with the points of the terrain, sensors with the road and with
+  the ground, the lowest road with the floor of the region.
+- Solids higher than any building, and a region where all solids are as high as towers, get a warning.
 
 Hillside houses, decks, bridges and elevated roads are valid: a slope, another solid or the terrain explains them.
 """
@@ -24,7 +26,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray
-from egvs.core.wording import by_number, list_first, number_of
+from egvs.core.wording import by_number, format_percent, list_first, number_of
 from egvs.scenario.model import TERRAIN_KEY
 from egvs.sensors.site_feasibility import ground_height_m
 from egvs.sensors.sites import Pose
@@ -51,6 +53,21 @@ MAX_DECK_M = 3.0
 
 MAX_BESIDE_M = 20.0
 """at most this high."""
+
+MAX_BUILDING_M = 830.0
+"""The highest building of the world has this height."""
+
+MIN_TOWER_M = 100.0
+"""Not all of several solids are higher than this,"""
+
+MIN_TOWERS = 5
+"""if there are this many."""
+
+MIN_SENSOR_M = 1.0
+"""Sensors lower than this above the ground get a warning: cars hide everything from them."""
+
+MAX_BELOW_ROADS = 0.3
+"""Largest part of the height of the region that may be below all roads in it."""
 
 MAX_SENSOR_M = 20.0
 """Sensors higher than this above the road, without a solid that carries them, get a warning."""
@@ -132,6 +149,24 @@ def _near_region_m(inputs: CheckInputs) -> tuple[FloatArray, FloatArray]:
 # --- solids, sites and terrain
 
 
+def warn_low_sites(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about sensors close to the ground, on which beams with traffic in the way end."""
+    if inputs.world is None or not inputs.scenario.statics.ground:
+        return
+    low = {}
+    for site in inputs.sites:
+        above_m = site.pose.z_m - ground_height_m(inputs.world, site.pose)
+        if site.points is None and 0.0 < above_m < MIN_SENSOR_M:
+            low[site.name] = above_m
+    if low:
+        names = list_first(list(low), _MAX_LISTED)
+        verb = by_number(len(low), "is", "are")
+        lowest_m = min(low.values())
+        problem = f"{number_of(len(low), 'sensor')} {verb} less than {MIN_SENSOR_M:g} m above the ground: {names}"
+        hint = f"Check z_m (the lowest is {lowest_m:.2g} m above the ground): it is in metres."
+        yield Diagnostic(RULE, "sites", problem, hint)
+
+
 def check_heights(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report solids, sites and terrain whose heights have another zero than the road."""
     reference = Reference.of_lanes(inputs)
@@ -139,6 +174,7 @@ def check_heights(inputs: CheckInputs) -> Iterator[Diagnostic]:
         return  # check_traffic_heights compares them with the traffic
     yield from compare_scene(inputs, reference)
     yield from _check_terrain(inputs, reference)
+    yield from _warn_region_below_roads(inputs, reference)
 
 
 def compare_scene(inputs: CheckInputs, reference: Reference) -> Iterator[Diagnostic]:
@@ -147,6 +183,7 @@ def compare_scene(inputs: CheckInputs, reference: Reference) -> Iterator[Diagnos
         extents = _Extents.of(inputs.world)
         for source in inputs.solid_sources:
             yield from _check_source(inputs, reference, extents, source)
+        yield from _warn_tall_solids(inputs, extents)
         yield from _warn_high_sites(inputs, reference, extents)
 
 
@@ -281,6 +318,50 @@ def _solid_diagnostic(
     pronoun = by_number(count, "it", "them (median)")
     problem = f"{count} of {number_of(total, 'solid')} near the region {verb} {pronoun}: {listed}"
     return Diagnostic(RULE, source.where, problem, source.zero_hint(change_m), is_error=is_error)
+
+
+def _warn_tall_solids(inputs: CheckInputs, extents: _Extents) -> Iterator[Diagnostic]:
+    """Warn for each file with a solid higher than any building, or near the region only with solids like towers."""
+    assert inputs.world is not None
+    near_low_m, near_high_m = _near_region_m(inputs)
+    is_near = np.all((extents.low_m[:, :2] <= near_high_m) & (extents.high_m[:, :2] >= near_low_m), axis=1)
+    height_m = extents.high_m[:, 2] - extents.low_m[:, 2]
+    for source in inputs.solid_sources:
+        solids = np.arange(source.first, source.end)
+        solids = solids[extents.is_solid[solids]]
+        tall = solids[height_m[solids] > MAX_BUILDING_M]
+        near = solids[is_near[solids]]
+        if tall.size:
+            listed = list_first([inputs.world.solids[solid][0] for solid in tall], _MAX_LISTED)
+            verb = by_number(len(tall), "is", "are")
+            problem = (
+                f"{number_of(len(tall), 'solid')} {verb} higher than any building ({MAX_BUILDING_M:g} m): {listed}"
+            )
+        elif len(near) >= MIN_TOWERS and height_m[near].min() > MIN_TOWER_M:
+            problem = f"all {len(near)} solids near the region are more than {height_m[near].min():,.0f} m high"
+        else:
+            continue
+        hint = "Use heights in metres above the foot of each solid, not above sea level."
+        yield Diagnostic(RULE, source.where, problem, hint)
+
+
+def _warn_region_below_roads(inputs: CheckInputs, reference: Reference) -> Iterator[Diagnostic]:
+    """Warn about a region of interest with much of its height below all roads in it."""
+    box = inputs.scenario.roi.box
+    low_m, high_m = np.asarray(box.origin_m), np.add(box.origin_m, box.size_m)
+    points_m = reference.points_m
+    points_m = points_m[np.all((points_m[:, :2] >= low_m[:2]) & (points_m[:, :2] <= high_m[:2]), axis=1)]
+    if not len(points_m):
+        return
+    road_m = float(points_m[:, 2].min())
+    share = (road_m - low_m[2]) / (high_m[2] - low_m[2])
+    if MAX_BELOW_ROADS < share < 1.0:
+        problem = (
+            f"{format_percent(share)} of the region's height is below all roads: it extends from z = {low_m[2]:g} to"
+            f" {high_m[2]:g} m, and the lowest road is at z = {road_m:.1f} m"
+        )
+        hint = f"center_m is the centre of the region, not its floor: use z = {road_m + box.size_m[2] / 2:.4g}."
+        yield Diagnostic(RULE, f"{inputs.scenario.file}: roi", problem, hint)
 
 
 def _warn_high_sites(inputs: CheckInputs, reference: Reference, extents: _Extents) -> Iterator[Diagnostic]:

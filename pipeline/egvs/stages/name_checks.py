@@ -1,7 +1,8 @@
-"""Rules for names: those that differ only in case, or in the Unicode of accents, are often meant to be one.
+"""Rules for names: those that differ only in case, accents or invisible characters are often meant to be one.
 
 Names are compared exactly everywhere, so ``Pole_1`` and ``pole_1`` are two sites. Names that differ only in the Unicode
-of accents look the same in every table, so they are an error; names that differ only in case are a warning.
+of accents, or in invisible characters, look the same in every table, so they are an error; names that differ only in
+case are a warning.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def check_similar_names(inputs: CheckInputs) -> Iterator[Diagnostic]:
 
 
 def compare_names(names: Iterable[str], where: str, noun: str) -> Iterator[Diagnostic]:
-    """Report names that differ only in the Unicode of accents, an error, or in case, a warning.
+    """Report names that differ only in what nobody sees, an error, or in case, a warning.
 
     Parameters
     ----------
@@ -50,7 +51,8 @@ def compare_names(names: Iterable[str], where: str, noun: str) -> Iterator[Diagn
         What has these names, plural.
     """
     pairs = list(similar_names(names))
-    for is_error, difference in ((True, "in the Unicode of accents"), (False, "in upper and lower case")):
+    unseen = "in the Unicode of accents or in invisible characters"
+    for is_error, difference in ((True, unseen), (False, "in upper and lower case")):
         listed = [
             f"{one!a} and {other!a}" if is_error else f"{one} and {other}"
             for one, other in pairs

@@ -136,19 +136,25 @@ def warn_repeated_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
         yield Diagnostic("repeated beams", where, problem, hint)
 
 
-def warn_few_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
-    """Warn about sensors with fewer beams than any LiDAR has."""
+def warn_odd_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about sensors with fewer beams than any LiDAR has, or with angles that look swapped or like radians."""
     scenario = inputs.scenario
     for name in dict.fromkeys(site.sensor for site in inputs.sites):
+        config = scenario.sensors.get(name)
+        if config is None:
+            continue  # of the catalogue
         try:
-            problem = sensor.describe_few_beams(scenario_sensor(name, scenario, name))
+            custom = scenario_sensor(name, scenario, name)
         except InputError:
             continue  # check_sensors_known reports it
-        if problem is not None:
-            config = scenario.sensors.get(name)
-            file = None if config is None else config.beam_file
-            where = f"sensors.{name}" if file is None else file[1]
-            yield Diagnostic("few beams", where, problem, sensor.FEW_BEAMS_HINT)
+        where = f"sensors.{name}" if config.beam_file is None else config.beam_file[1]
+        few = sensor.describe_few_beams(custom)
+        if few is not None:
+            yield Diagnostic("few beams", where, few, sensor.FEW_BEAMS_HINT)
+        offsets_deg = custom.azimuth_offsets_deg if custom.table is None else ()
+        odd = sensor.describe_odd_angles(name, custom.beam_table.elevation_deg, offsets_deg)
+        if odd is not None:
+            yield Diagnostic("beam angles", where, *odd)
 
 
 def check_effects(inputs: CheckInputs) -> Iterator[Diagnostic]:
@@ -201,6 +207,24 @@ def check_poses(inputs: CheckInputs) -> Iterator[Diagnostic]:
         names = list_first(blind, MAX_LISTED_SITES)
         problem = f"{len(blind)} of {len(inputs.sites)} sites have no beam that meets the region of interest: {names}"
         yield Diagnostic("beams beside the region", "sites", problem, "Change yaw, pitch, position or sensor.")
+
+
+NEAR_M = 5.0
+"""Of a sensor within the region, beams that have left it through its top at this distance do not count."""
+
+NOSE_UP_DEG = (30.0, 80.0)
+"""Pitches between these get a warning; with 90 degrees, a sensor that turns is mounted sideways."""
+
+
+def warn_nose_up(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about sensors that are pitched far up."""
+    low_deg, high_deg = NOSE_UP_DEG
+    names = [site.name for site in inputs.sites if low_deg < site.pose.pitch_deg < high_deg and site.points is None]
+    if names:
+        verb = by_number(len(names), "points", "point")
+        listed = list_first(names, MAX_LISTED_SITES)
+        problem = f"{number_of(len(names), 'sensor')} {verb} more than {low_deg:g} degrees up: {listed}"
+        yield Diagnostic("nose up", "sites", problem, "Positive pitch_deg is nose up; use a negative one to look down.")
 
 
 MIN_RADIANS_YAW = 1.5
@@ -319,9 +343,12 @@ def warn_dropped_sites(inputs: CheckInputs) -> Iterator[Diagnostic]:
 
 def _reaches_region(inputs: CheckInputs, site: Site, sensor: Sensor) -> bool:
     box = inputs.scenario.roi.box
-    ends = _cached_directions(sensor, site.pose.angles_deg) * sensor.range_m
-    reaches = np.empty(len(ends), dtype=np.bool_)
-    ray_triangle.can_meet_box(np.subtract(site.pose.position_m, box.origin_m), ends, np.asarray(box.size_m), reaches)
+    directions = _cached_directions(sensor, site.pose.angles_deg)
+    start_m, size_m = np.subtract(site.pose.position_m, box.origin_m), np.asarray(box.size_m)
+    if np.all((start_m >= 0) & (start_m <= size_m)):
+        return bool((start_m[2] + NEAR_M * directions[:, 2] <= size_m[2]).any())  # others look at the sky
+    reaches = np.empty(len(directions), dtype=np.bool_)
+    ray_triangle.can_meet_box(start_m, directions * sensor.range_m, size_m, reaches)
     return bool(reaches.any())
 
 
@@ -365,6 +392,51 @@ def warn_solids_over_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
         if reading is not None:
             problem += f"; {reading}, they would cover almost none"
     yield Diagnostic("solids over lanes", "statics", problem, hint)
+
+
+WALL_M = (2.0, clearances.CLEARANCE_M)
+"""Heights above the road between which walls are in the way; parked cars and guard rails are lower."""
+
+MIN_WALL_M2 = 10.0
+_MAX_UPRIGHT = 0.3
+"""Upright triangles have at most this part of their area in plan."""
+
+
+def warn_walls_over_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about walls across lanes of surfaces without an inside, which have no area in plan."""
+    world, carriageway = inputs.world, inputs.carriageway
+    if world is None or carriageway is None or world.closed.all():
+        return
+    import shapely
+
+    low_m, high_m = _surroundings(inputs.scenario.roi.box)
+    is_open = ~world.closed & np.array([kind != "ground" for _, kind in world.solids], dtype=np.bool_)
+    faces = np.flatnonzero(is_open[world.solid_of_face])
+    corners_m = world.triangles_m[faces]
+    normals_m2 = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]) / 2.0
+    areas_m2 = np.linalg.norm(normals_m2, axis=1)
+    middles_m = corners_m.mean(axis=1)
+    is_upright = np.abs(normals_m2[:, 2]) < _MAX_UPRIGHT * areas_m2
+    is_upright &= np.all((middles_m[:, :2] >= low_m) & (middles_m[:, :2] <= high_m), axis=1)
+    upright = np.flatnonzero(is_upright)
+    in_the_way: set[int] = set()
+    for row, lane in carriageway.touching(shapely.points(middles_m[upright, :2])).T:
+        face = int(upright[row])
+        above_m = middles_m[face, 2] - carriageway.height_m(int(lane), middles_m[face, :2])
+        if WALL_M[0] <= above_m <= WALL_M[1]:
+            in_the_way.add(face)
+    listed = sorted(in_the_way)
+    solids = world.solid_of_face[faces[listed]]
+    wall_m2 = np.bincount(solids, areas_m2[listed], len(world.solids))
+    for solid in np.flatnonzero(wall_m2 >= MIN_WALL_M2):
+        name, kind = world.solids[solid]
+        spot = _format_position(middles_m[listed][solids == solid, :2].mean(axis=0))
+        problem = (
+            f"walls of {name} ({kind}) are across lanes: {wall_m2[solid]:.0f} m2 between 2 and 4.5 m, around {spot}"
+        )
+        yield Diagnostic(
+            "solids over lanes", "statics", problem, "Check its coordinates, and that z is up in its file."
+        )
 
 
 def warn_repeated_solids(inputs: CheckInputs) -> Iterator[Diagnostic]:

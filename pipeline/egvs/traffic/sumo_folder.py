@@ -10,7 +10,6 @@ compared exactly.
 
 from __future__ import annotations
 
-import shutil
 import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -411,10 +410,7 @@ def _make_empty(folder: Path, inputs: Iterable[Path]) -> None:
         if path.resolve().is_relative_to(folder.resolve()):
             hint = "Use another --out, or move the file."
             raise InputError(path, "an input file is in a folder that egvs empties for SUMO", hint)
-    if folder.is_symlink():
-        folder.unlink()
-    elif folder.exists():
-        shutil.rmtree(folder)
+    files.remove_folder(folder)
     folder.mkdir(parents=True)
 
 

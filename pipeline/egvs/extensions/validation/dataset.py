@@ -498,6 +498,7 @@ def _check_empty(folder: Path) -> None:
 @contextmanager
 def _partial_folder(folder: Path) -> Iterator[Path]:
     """Yield a folder to write to, and rename it at the end; after an exception, remove it."""
+    files.check_no_link(folder / README_FILE)
     target = folder.resolve()
     partial = target.with_name(f".{target.name}.partial")
     try:

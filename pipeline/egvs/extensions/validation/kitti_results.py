@@ -20,7 +20,6 @@ Frames have the numbers of ``egvs clouds``, so its clouds fit; ``--detections`` 
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -192,15 +191,14 @@ def write_kitti_results(
         By site and detector.
     """
     partial = folder.with_name(PARTIAL_FOLDER)
-    shutil.rmtree(partial, ignore_errors=True)
+    files.remove_folder(partial)
     for site, by_detector in results.items():
         level = LevelFrame(record.scene.site(site).pose)
         _write_truth(partial / site, record, frames, level)
         for name, result in by_detector.items():
             if isinstance(result, DetectedBoxes):
                 _write_boxes(partial / site / name, frames, result, level)
-    if folder.exists():
-        shutil.rmtree(folder)
+    files.remove_folder(folder)
     partial.rename(folder)
 
 
