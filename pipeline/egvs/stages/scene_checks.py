@@ -189,9 +189,7 @@ def warn_losses(inputs: CheckInputs) -> Iterator[Diagnostic]:
         rated_range_m = (config and config.rated_range_m) or custom.rated_range_m
         if rated_range_m is not None and "rated_reflectivity" not in custom.model_fields_set:
             share = format_percent(custom.rated_reflectivity, 0)
-            problem = (
-                f"rated_reflectivity is missing: {rated_range_m:g} m are taken as the range of a target of {share}"
-            )
+            problem = f"rated_reflectivity is missing: {rated_range_m:g} m are taken as rated for a target of {share}"
             hint = "Enter that of the data sheet, often 0.1."
             yield Diagnostic("rated range", f"{scenario.file}: sensors.{name}", problem, hint)
 

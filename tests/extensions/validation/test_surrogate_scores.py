@@ -171,9 +171,8 @@ def test_density_is_points_per_road_area():
     assert value("density", road(list(OFF.values()))) == 0.0
     assert value("density", road(list(AT.values()), returned=[True, False, True, True])) == pytest.approx(3 / 1.5)
     assert value("density", road(list(AT.values()), weight=np.array([0.5, 1, 1, 1]))) == pytest.approx(3.5 / 1.5)
-    assert value(
-        "density", road(list(AT.values()), detection_probability=by_range(lambda r: 0 * r + 0.25))
-    ) == pytest.approx(1 / 1.5)
+    quarter = by_range(lambda r: 0 * r + 0.25)
+    assert value("density", road(list(AT.values()), detection_probability=quarter)) == pytest.approx(1 / 1.5)
 
 
 def test_uniformity_is_spread_of_density_over_squares():
