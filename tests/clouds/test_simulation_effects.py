@@ -49,7 +49,7 @@ def test_lost_returns_have_probability_of_score(mini, settings):
 
 
 def test_scenario_sets_the_losses_of_road_users_only(mini):
-    """A reflectivity or an incidence of road users leaves the returns from the static world as they are, draw by draw."""
+    """A reflectivity or an incidence of road users leaves the returns from the static world as they are, one by one."""
     frame = random_frame(np.random.default_rng(2), (20.0, 5.0, 0.0))
     static, moving = [], []
     for more in ("", ", reflectivity=0.001", ", incidence_deg=85", ", reflectivity=3"):
