@@ -404,7 +404,7 @@ class RecordLayout:
         last
             Whether nothing may follow the points.
         """
-        rows = [(number, row) for number, row in enumerate(text.splitlines(), line) if row.strip()][skip:]
+        rows = [(number, row) for number, row in enumerate(text.splitlines(), line) if row.strip(PADDING)][skip:]
         if len(rows) < self.n or (last and len(rows) > self.n):
             raise InputError(
                 self.where,

@@ -437,6 +437,21 @@ def test_rejects_broken_maps(
 
 
 @pytest.mark.system
+def test_speed_limits_of_roads_and_lanes(tmp_path: Path) -> None:
+    """Road 1 has 25 mph, and 30 km/h from 60 m on; road 2 has none but that of its lane -1."""
+    speed = '<type s="0" type="town"><speed max="50" unit="km/h"/></type>'
+    first, second = maps.two_roads()
+    changing = (speed + speed.replace('"0"', '"60"', 1)).replace('max="50" unit="km/h"', 'max="25" unit="mph"', 1)
+    first = first.replace(speed, changing.replace("50", "30"))
+    own = '<speed sOffset="0" max="10" unit="m/s"/></lane></right>'
+    second = second.replace(speed, "").replace("</lane></right>", own)
+    road_map, roads = convert(tmp_path, maps.opendrive(first, second))
+    speeds = sorted({(edge.from_node, edge.id): round(edge.lanes[0].speed_m_s, 1) for edge in roads.edges}.values())
+    assert speeds == [8.3, 8.3, 10.0, 11.2, 11.2, 13.9]
+    assert "1 of 2 roads has no speed limit: 50 km/h assumed, 2." in road_map.notes
+
+
+@pytest.mark.system
 @pytest.mark.slow
 def test_town01_keeps_all_lanes_and_turns(tmp_path: Path) -> None:
     """Road 1 is 157.54 m long, between the junctions 43 and 26; it leads to road 25 by a turn in junction 26."""

@@ -234,6 +234,8 @@ class Road:
         Lane sections, sorted.
     signals
         Signals and signs.
+    states_speed
+        Whether the road, or each of its lanes for driving, has a speed limit.
     """
 
     id: str
@@ -249,6 +251,7 @@ class Road:
     lane_offsets: tuple[Cubic, ...]
     sections: tuple[LaneSection, ...]
     signals: tuple[RoadSignal, ...]
+    states_speed: bool = False
 
     def is_light_elsewhere(self, signal: RoadSignal) -> bool:
         """Return whether a signal is a traffic light for traffic towards an end that is at no junction."""
@@ -440,7 +443,30 @@ def _parse_road(element: Element) -> Road:
         lane_offsets=_parse_cubics(element.iterfind("lanes/laneOffset")),
         sections=tuple(_parse_sections(element, length_m)),
         signals=tuple(map(_parse_signal, element.iterfind("signals/signal"))),
+        states_speed=_states_speed(element),
     )
+
+
+def speed_limits(road: Element) -> Iterator[tuple[float, dict[str, str]]]:
+    """Yield the speed limits of a ``<road>``: distance from its start in metres, and attributes ``max`` and ``unit``.
+
+    ``no limit``, ``undefined`` and other words are left out.
+    """
+    for kind in road.iterfind("type"):
+        speed = kind.find("speed")
+        if speed is None:
+            continue
+        try:
+            value, start_m = float(speed.get("max", "")), float(kind.get("s", "0"))
+        except ValueError:
+            continue
+        if 0 < value < math.inf and 0 <= start_m < math.inf:
+            yield start_m, {key: speed.attrib[key] for key in ("max", "unit") if key in speed.attrib}
+
+
+def _states_speed(road: Element) -> bool:
+    lanes = [lane for lane in road.iter("lane") if lane.get("type") == "driving"]
+    return any(speed_limits(road)) or all(lane.find("speed") is not None for lane in lanes)
 
 
 def _parse_plan(element: Element) -> PlanElement:

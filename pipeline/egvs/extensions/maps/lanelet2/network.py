@@ -155,8 +155,10 @@ class NetworkBuilder:
         self, connections: list[PlainElement], signals: list[PlainElement], flags: Sequence[str]
     ) -> list[PlainElement]:
         """Return the roundabouts that netconvert finds."""
+        counted, self.assumed = self.assumed, rules.Assumptions()
         nodes = [self._node(node, 0) for node in self._layout.nodes()]
         edges = [self._edge(road, 0.0) for road in self._layout.roads.values()]
+        self.assumed = counted  # these roads are not counted again
         text = self._convert(PlainNetwork(self._frame, nodes, edges, connections, signals), flags)
         try:
             rings = read_network_text(text).roundabouts

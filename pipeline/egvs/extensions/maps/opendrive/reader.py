@@ -361,8 +361,15 @@ def comparison_notes(comparison: MapComparison, road_map: OpenDriveMap) -> tuple
 
 
 def _map_notes(road_map: OpenDriveMap) -> tuple[str, ...]:
-    """Return sentences on what no network can have."""
-    notes = []
+    """Return sentences on what no network can have, and on what the map does not state."""
+    notes = ["Road classes are assumed by speed limit."]
+    roads = [road for road in road_map.roads.values() if not road.junction]
+    without_speed = [road.id for road in roads if not road.states_speed]
+    if without_speed:
+        notes.append(
+            f"{len(without_speed)} of {number_of(len(roads), 'road')} {by_number(len(without_speed), 'has', 'have')} no"
+            f" speed limit: 50 km/h assumed, {_listed(without_speed)}."
+        )
     sloped = [road.id for road in road_map.roads.values() if any(any(cubic[1:]) for cubic in road.superelevations)]
     if sloped:
         notes.append(
