@@ -240,11 +240,7 @@ class Detect(Effect[P]):
         raise NotImplementedError
 
     def detect_surface(
-        self,
-        range_m: FloatArray,
-        sensor: Sensor,
-        reflectivity: FloatArray | None,
-        of_class: FloatArray | None = None,
+        self, range_m: FloatArray, sensor: Sensor, reflectivity: FloatArray | None, of_class: FloatArray | None = None
     ) -> FloatArray:
         """Return the detection probability as :meth:`detect`, of surfaces of known reflectivity, if it matters.
 

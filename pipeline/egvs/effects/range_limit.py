@@ -89,11 +89,7 @@ class RangeLimit(Detect[RangeLimitParameters]):
         return self.return_model(sensor).probability(range_m)
 
     def detect_surface(
-        self,
-        range_m: FloatArray,
-        sensor: Sensor,
-        reflectivity: FloatArray | None,
-        of_class: FloatArray | None = None,
+        self, range_m: FloatArray, sensor: Sensor, reflectivity: FloatArray | None, of_class: FloatArray | None = None
     ) -> FloatArray:
         """Return the probability for surfaces, see :meth:`egvs.effects.base.Detect.detect_surface`."""
         model = self.return_model(sensor)

@@ -275,7 +275,7 @@ class LossDecision:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was decided: a line for sensors with losses, and one for sensors without a rated range."""
+        """What was decided: lines for sensors with losses, and for each without a rated range."""
         notes = []
         if self.acting:
             needing = {name: values for name, values in self.acting.items() if values[0] > values[1]}
