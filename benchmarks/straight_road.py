@@ -23,11 +23,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from egvs.core.grid import FloatArray, Grid
+from egvs.effects.range_limit import RangeLimit
+from egvs.effects.returns import ReturnProbability
+from egvs.scenario.effects_config import RangeLimitParameters
 from egvs.scoring.noticed import noticed_chances
 from egvs.scoring.target_scores import DETECTORS, chances_by_detector
 from egvs.scoring.targets import TargetRecord, TargetVisibility, visible_targets
 from egvs.scoring.visibility import Beams
-from egvs.sensors.return_model import ReturnModel
 from egvs.sensors.sensor import Sensor, resolve_sensor
 from egvs.sensors.sites import Pose
 
@@ -93,7 +95,8 @@ def road_beams(sensor: Sensor) -> Beams:
 
 def view_of_road(sensor: Sensor, record: TargetRecord) -> TargetVisibility:
     """Return what a sensor sees of each car, with losses of returns."""
-    return visible_targets(record, road_beams(sensor), ReturnModel.of(sensor).probability)
+    losses = ReturnProbability((RangeLimit(RangeLimitParameters()),), sensor)
+    return visible_targets(record, road_beams(sensor), losses)
 
 
 def rows(sensors: Sequence[int] = tuple(sorted(PUBLISHED))) -> list[Row]:

@@ -28,7 +28,6 @@ SWEEPS = 20
         ["effects.dropout.share=0.3"],
         ["effects.rain.rate_mm_h=200"],
         ["effects.fog.visibility_m=60", "effects.dropout.share=0.1"],
-        ["effects.range_limit.reflectivity=0.05", "effects.range_limit.rated_range_m=60"],
     ],
     ids=lambda settings: settings[0].split(".")[1],
 )
@@ -47,6 +46,21 @@ def test_lost_returns_have_probability_of_score(mini, settings):
     for some in (near, ~near):
         spread = math.sqrt(SWEEPS * (chance * (1 - chance))[some].sum())
         assert abs(detected[met[some]].sum() - SWEEPS * chance[some].sum()) < 4 * spread
+
+
+def test_scenario_sets_the_losses_of_road_users_only(mini):
+    """A reflectivity or an incidence of road users leaves the returns from the static world as they are, one by one."""
+    frame = random_frame(np.random.default_rng(2), (20.0, 5.0, 0.0))
+    static, moving = [], []
+    for more in ("", ", reflectivity=0.001", ", incidence_deg=85", ", reflectivity=3"):
+        scene = build_scene(mini, f"effects.range_limit={{rated_range_m=40, rated_reflectivity=0.1{more}}}")
+        simulator = CloudSimulator(scene, POSE, make_sensor(**FINE), "here")
+        on_body = simulator.first_hits(frame).owner >= 0
+        beam = simulator.sweep(frame, sweep_rng(1, "here", 0)).sweep.beam
+        static.append(beam[~on_body[beam]].tolist())
+        moving.append(int(on_body[beam].sum()))
+    assert static[0] == static[1] == static[2] == static[3] and len(static[0]) > 100
+    assert moving[1] < moving[2] < moving[0] < moving[3]
 
 
 def test_dropout_of_all_returns(mini):
@@ -230,12 +244,12 @@ def test_points_on_vehicles_are_those_that_scores_expect(mini):
     ("settings", "kind"),
     [
         (["effects.range_limit={rated_range_m=30}"], "pedestrian"),
-        (["effects.range_limit={rated_range_m=30, reflectivity=0.03}", "effects.dropout.share=0.2"], "passenger"),
+        (["effects.range_limit={rated_range_m=30, reflectivity=0.05}", "effects.dropout.share=0.2"], "pedestrian"),
     ],
     ids=["by_class", "of_all"],
 )
 def test_mean_count_of_points_is_that_of_the_scores(mini, settings, kind):
-    """Boxes as bodies, without windows: over many sweeps, vehicles have as many points as scores expect."""
+    """Boxes as bodies, of a class without windows: over many sweeps, they have as many points as scores expect."""
     settings = [*settings, "effects.range_limit.rated_reflectivity=0.1", *use_boxes_for(mini, "pedestrian", "sedan")]
     scene, sensor = build_scene(mini, *settings), make_sensor(**FINE)
     rows = [(x, y, 0.8, 4.4, 1.8, 1.5, yaw, 0.0) for x, y, yaw in ((14, 4, 0.3), (22, 6, 1.2), (19, -4, 2.0))]

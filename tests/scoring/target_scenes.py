@@ -9,15 +9,21 @@ import cmath
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.grid import Grid
+from egvs.effects.base import Detect
+from egvs.effects.returns import ReturnProbability
+from egvs.scenario.effects_config import EffectParameters
 from egvs.scoring.targets import TargetRecord, VisibleTargets, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors import sensor
+from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Pose
 
 GRID = Grid((100.0, 200.0, 0.0), 1.0, (40, 20, 5))
@@ -25,6 +31,21 @@ SENSOR = sensor.CATALOGUE["VLP-16"]
 SHRINK_M = 1e-4 + 1e-9
 
 Noticed = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class LossesByRange(Detect[EffectParameters]):
+    """An effect that detects returns by a function of the range, and leaves extents as they are."""
+
+    shares: Noticed
+    NAME: ClassVar[str] = "by_range"
+
+    def detect(self, range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
+        return self.shares(range_m)
+
+
+def by_range(noticed: Noticed) -> ReturnProbability:
+    return ReturnProbability((LossesByRange(EffectParameters(), noticed),), SENSOR)
 
 
 def frame(boxes, kinds=None, pitch=None, number=0, vehicles=None, part=None) -> TrafficFrame:
@@ -45,7 +66,7 @@ def beams_to(at, ends, weight=None) -> Beams:
 
 def seen(frames: Sequence[TrafficFrame], beams: Beams, noticed: Noticed | None = None) -> VisibleTargets:
     """What is seen in the grid of these tests."""
-    return visible_targets(TargetRecord.of(frames, GRID), beams, noticed)
+    return visible_targets(TargetRecord.of(frames, GRID), beams, None if noticed is None else by_range(noticed))
 
 
 def axes_of(yaw: float, pitch: float) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from egvs.scoring.fused_targets import fuse_targets
 from egvs.scoring.target_scores import detection_chances, expected_detections
 from egvs.scoring.targets import TargetRecord, TargetVisibility, VisibleTargets, visible_targets
 from egvs.scoring.visibility import Beams
-from tests.scoring.target_scenes import COLUMNS, GRID, beams_to, frame, fused_slowly, random_boxes
+from tests.scoring.target_scenes import COLUMNS, GRID, beams_to, by_range, frame, fused_slowly, random_boxes
 
 CAR = (120.0, 210.0, 0.75, 4.0, 2.0, 1.5, 0.0)
 """Along x from 118 to 122, its sides at y = 209 and 211."""
@@ -123,7 +123,7 @@ def test_all_points_thrown_together_give_the_same(seed: int) -> None:
 def test_the_order_of_sensors_does_not_matter() -> None:
     rng = np.random.default_rng(8)
     record = TargetRecord.of([frame(random_boxes(rng, 12))], GRID)
-    views = [visible_targets(record, beams, lambda r: np.exp(-r / 30.0)) for beams in scans_of(rng, 3)]
+    views = [visible_targets(record, beams, by_range(lambda r: np.exp(-r / 30.0))) for beams in scans_of(rng, 3)]
     first = fuse_targets(views)
     for order in itertools.permutations(views):
         other = fuse_targets(order)

@@ -79,6 +79,19 @@ def test_parameters_of_the_effect_replace_those_of_the_sensor() -> None:
         ReturnModel.of(replace(sensor, name="dark", rated_range_m=None))
 
 
+def test_scenario_sets_what_road_users_reflect_and_leaves_the_static_world() -> None:
+    """A window, a whole road user and the ground, which has its own incidence in its reflectivity."""
+    surfaces, of_class = np.array([0.0225, 0.03, 0.17]), np.array([0.03, 0.03, np.nan])
+    plain = ReturnModel(55.0, 0.1)
+    assert plain.surface_reflectivity(surfaces, of_class).tolist() == surfaces.tolist()
+    tilted = replace(plain, incidence_deg=60.0)
+    np.testing.assert_allclose(tilted.surface_reflectivity(surfaces, of_class), [0.01125, 0.015, 0.17])
+    bright = replace(tilted, reflectivity=0.2)
+    np.testing.assert_allclose(bright.surface_reflectivity(surfaces, of_class), [0.075, 0.1, 0.17])
+    assert bright.target_reflectivity("bus") == pytest.approx(0.1)
+    assert bright.surface_reflectivity(np.array([0.03])).tolist() == pytest.approx([0.1])
+
+
 def test_each_vclass_belongs_to_one_class_with_a_source() -> None:
     classes = road_user_classes()
     listed = [vclass for road_users in classes.values() for vclass in road_users.vclasses]
@@ -122,7 +135,7 @@ def test_beams_that_end_before_losses_begin_lose_nothing() -> None:
     assert "rated" in decide_losses(sites_at(0.0, "rated"), {"rated": replace(RATED, range_m=13.5)}, ROI).acting
 
 
-def test_farthest_site_of_a_sensor_decides_and_others_have_no_say() -> None:
+def test_farthest_site_of_a_sensor_decides_for_all_sensors() -> None:
     far = replace(RATED, name="far", rated_range_m=400.0)
     unrated = replace(RATED, name="unrated", rated_range_m=None)
     sensors = {sensor.name: sensor for sensor in (RATED, far, unrated)}
@@ -132,5 +145,10 @@ def test_farthest_site_of_a_sensor_decides_and_others_have_no_say() -> None:
     assert "losses of returns are simulated for rated (13 m), far (96 m)" in decided
     assert unknown.endswith("Enter rated_range_m and rated_reflectivity under [sensors.unrated]")
     near = decide_losses(sites_at(20.0, "far"), sensors, ROI)
+    mixed = decide_losses(sites_at(20.0, "rated", "far"), sensors, ROI)
+    assert mixed.to_json() == {"on": ["rated", "far"], "negligible": [], "unrated": []}
+    decided, others = mixed.notes
+    assert "are simulated for rated (13 m): the region reaches to 23 m" in decided
+    assert others == "losses of returns are simulated for far, too: for all sensors or none"
     assert (near.notes, list(near.negligible)) == ((), ["far"])
     assert near.negligible_note == "not called for: far lose at most 5 % of returns from the region"

@@ -402,6 +402,29 @@ def test_rejects_range_limit_without_rated_range(street: Path, softness: float) 
     assert told == {"effects": ["effects.range_limit: sensor small: rated_range_m is missing"]}
 
 
+SURFACES = "effects.surface_losses={}"
+RATED = ("sensors.small.rated_range_m=30", "sensors.small.rated_reflectivity=0.1")
+
+
+def test_warns_about_surfaces_that_lose_returns_twice(street: Path) -> None:
+    problem = "dark vehicles and windows are part of the losses of returns too: clouds lose these returns twice"
+    twice = {"losses twice": [f"[scenario.toml: effects.surface_losses: {problem}]"]}
+    assert found(street, SURFACES, *RATED) == twice
+    assert found(street, SURFACES, *RATED, "effects.range_limit={}") == twice
+    for settings in ((SURFACES,), RATED, (SURFACES, *RATED, "effects.range_limit=false")):
+        assert found(street, *settings) == {}
+
+
+def test_warns_about_a_rated_range_without_its_reflectivity(street: Path) -> None:
+    told = found(street, RATED[0])
+    problem = "rated_reflectivity is missing: 30 m are taken as rated for a target of 80 %"
+    assert told == {"rated range": [f"[scenario.toml: sensors.small: {problem}]"]}
+    assert list(found(street, "effects.range_limit={rated_range_m=40}")) == ["rated range"]
+    for setting in ("sensors.small.rated_reflectivity=0.8", "effects.range_limit=false",
+                    "effects.range_limit={rated_reflectivity=0.1}"):  # fmt: skip
+        assert found(street, RATED[0], setting) == {}
+
+
 # ---- the command, and the run
 
 

@@ -65,6 +65,22 @@ def test_sensor_whose_losses_cannot_matter_has_the_bytes_of_before(mini: Path, t
     assert "losses" not in RunRecord.read(tmp_path / "far").stages["check"].summary
 
 
+def test_sensor_whose_losses_cannot_matter_has_them_beside_one_that_needs_them(mini: Path, tmp_path: Path) -> None:
+    """Without them, it would gain on the other by its dropout."""
+    text = (mini / "scenario.toml").read_text()
+    table = text[text.index("[sensors.small]") :].partition("\n[")[0]
+    (mini / "scenario.toml").write_text(f"{text}\n{table.replace('sensors.small', 'sensors.far')}\n")
+    header, first, second = (mini / "sites.csv").read_text().split()
+    (mini / "sites.csv").write_text(f"{header},sensor\n{first},small\n{second},far\n")
+    far = ("sensors.far.rated_range_m=4000", "sensors.far.rated_reflectivity=0.1")
+    off = shares(mini, tmp_path / "off", *far, *RATED, OFF)
+    both = shares(mini, tmp_path / "both", *far, *RATED)
+    assert shares(mini, tmp_path / "alone", *far) == off, "neither needs losses"
+    assert all(0.0 < a < b for a, b in zip(both, off, strict=True))
+    losses = RunRecord.read(tmp_path / "both").stages["score"].summary["losses"]
+    assert losses == {"on": ["small", "far"], "negligible": [], "unrated": []}
+
+
 def test_plan(mini: Path, tmp_path: Path, by_itself: list[float]) -> None:
     placed = egvs.place(
         egvs.load(mini, [*RATED, "placement.count=1", "score.rank_by=expected_detections"]),

@@ -557,11 +557,14 @@ class CloudSimulator:
         on_body = owner >= 0
         reflectivity: FloatArray = hits.intensity[rows].astype(np.float64)  # of the static world, times the cosine
         classes = [class_of(vclass) for vclass in frame.kinds]
+        whole = np.array([road_users.reflectivity for road_users in classes])
         body = np.array([road_users.body_reflectivity for road_users in classes])
         glass = np.array([road_users.glass_reflectivity for road_users in classes])
         is_glass = self._bodies.surfaces[triangle[on_body]] == "glass"
         reflectivity[on_body] = np.where(is_glass, glass[owner[on_body]], body[owner[on_body]])
-        probability = self._return_probability(hits.range_m[rows], reflectivity)
+        of_class = np.full(len(rows), np.nan)
+        of_class[on_body] = whole[owner[on_body]]
+        probability = self._return_probability(hits.range_m[rows], reflectivity, of_class)
         return rows[rng.random(len(rows)) < probability]
 
     def _empty_range_m(self, scan: EmptyScan, beams: int) -> FloatArray:

@@ -239,8 +239,23 @@ class Detect(Effect[P]):
         """
         raise NotImplementedError
 
-    def detect_surface(self, range_m: FloatArray, sensor: Sensor, reflectivity: FloatArray | None) -> FloatArray:
-        """Return the detection probability as :meth:`detect`, of targets of known reflectivity (n,), if it matters."""
+    def detect_surface(
+        self, range_m: FloatArray, sensor: Sensor, reflectivity: FloatArray | None, of_class: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the detection probability as :meth:`detect`, of surfaces of known reflectivity, if it matters.
+
+        Parameters
+        ----------
+        range_m
+            Range of each surface, (n,) float64.
+        sensor
+            The sensor.
+        reflectivity
+            Reflectivity of each surface, (n,) float64; that of cars if None.
+        of_class
+            Reflectivity of the class of the road user that each surface belongs to, (n,) float64; NaN for the static
+            world. None if all surfaces are whole road users.
+        """
         return self.detect(range_m, sensor)
 
 

@@ -4,9 +4,9 @@ Model: the power law of returns from diffuse surfaces, with the threshold of the
 and defaults are in :mod:`egvs.sensors.return_model`. With softness 0 the limit is hard (Goodin et al. 2019, Electronics
 8(1):89): detected up to :math:`r_{max}`, nothing beyond.
 
-The effect acts by itself for the sensors whose losses can change the result
-(:func:`egvs.sensors.return_model.decide_losses`); with ``[effects.range_limit]`` it acts for all of them, with
-``effects.range_limit = false`` for none.
+The effect acts by itself, for all sensors with a rated range, if the losses of any can change the result
+(:func:`egvs.sensors.return_model.decide_losses`); with ``[effects.range_limit]`` it always acts, with
+``effects.range_limit = false`` never.
 
 The width of the normal distribution: Ouster's OS1 (revision 6) detects 10 % targets at 45 m with a probability above
 90 %, and at 55 m above 50 %. Read as equalities, that is s = 0.31, of a flat target of one reflectivity. On cars it was
@@ -20,8 +20,8 @@ multiplied: the joint loss of power is not compared with one threshold.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar, Self
 
 from egvs.core.grid import FloatArray
 from egvs.effects.base import Detect
@@ -37,13 +37,10 @@ class RangeLimit(Detect[RangeLimitParameters]):
 
     Attributes
     ----------
-    sensors
-        Names of the sensors with losses; None for all.
     skips_unrated
         Whether a sensor without a rated range has no losses, instead of raising an error.
     """
 
-    sensors: frozenset[str] | None = None
     skips_unrated: bool = False
     NAME: ClassVar[str] = "range_limit"
     SOURCE: ClassVar[str] = (
@@ -54,16 +51,17 @@ class RangeLimit(Detect[RangeLimitParameters]):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The parameters, the reflectivities of all classes, and the sensors with losses if not all."""
-        classes = {name: road_users.reflectivity for name, road_users in road_user_classes().items()}
-        settings = super().settings | {"classes": classes}
-        return settings if self.sensors is None else settings | {"sensors": sorted(self.sensors)}
+        """The parameters, and the reflectivities of all classes."""
+        return super().settings | {"classes": {name: users.reflectivity for name, users in road_user_classes().items()}}
+
+    @classmethod
+    def of(cls, model: ReturnModel) -> Self:
+        """Return the effect with the losses of a model."""
+        return cls(RangeLimitParameters(**asdict(model)))
 
     def acts_on(self, sensor: Sensor) -> bool:
         """Return whether the losses of a sensor are simulated."""
-        if self.skips_unrated and sensor.rated_range_m is None:
-            return False
-        return self.sensors is None or sensor.name in self.sensors
+        return not (self.skips_unrated and sensor.rated_range_m is None)
 
     def why_idle(self, scene: Scene) -> str | None:
         """A hard limit beyond the range of all sensors changes nothing; the range of a measured scan is unknown."""
@@ -90,8 +88,11 @@ class RangeLimit(Detect[RangeLimitParameters]):
         """Return the probability for cars, see :meth:`egvs.sensors.return_model.ReturnModel.probability`."""
         return self.return_model(sensor).probability(range_m)
 
-    def detect_surface(self, range_m: FloatArray, sensor: Sensor, reflectivity: FloatArray | None) -> FloatArray:
-        """Return the probability for targets of some reflectivity, unless the scenario sets that of all targets."""
-        if self.parameters.reflectivity is not None:
-            reflectivity = None
-        return self.return_model(sensor).probability(range_m, reflectivity)
+    def detect_surface(
+        self, range_m: FloatArray, sensor: Sensor, reflectivity: FloatArray | None, of_class: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the probability for surfaces, see :meth:`egvs.effects.base.Detect.detect_surface`."""
+        model = self.return_model(sensor)
+        if reflectivity is not None:
+            reflectivity = model.surface_reflectivity(reflectivity, of_class)
+        return model.probability(range_m, reflectivity)

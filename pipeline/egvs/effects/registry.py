@@ -29,7 +29,7 @@ AUTO_ENABLED: dict[str, Callable[[Scenario], bool]] = {"slope": sumo_folder.may_
 """Effects that are enabled automatically, each with a quick test of whether it may act."""
 
 LOSSES = "range_limit"
-"""The effect that is enabled automatically for the sensors that need it, see :mod:`egvs.sensors.return_model`."""
+"""The effect that is enabled automatically if a sensor needs it, see :mod:`egvs.sensors.return_model`."""
 
 
 def effect_names() -> list[str]:
@@ -82,11 +82,10 @@ def scenario_effects(scenario: Scenario, *stages: str) -> tuple[base.Effect[Any]
     return tuple(effect for effect in effects if effect.STAGE in stages)
 
 
-def make_losses(sensors: Iterable[str] | None) -> base.Effect[Any]:
-    """Return the losses of some sensors, by name, or for None of all with a rated range, with the sensors' values."""
+def make_losses() -> base.Effect[Any]:
+    """Return the losses of all sensors with a rated range, with the sensors' values."""
     effect_class = load_effect_class(LOSSES)
-    names = None if sensors is None else frozenset(sensors)
-    return effect_class(effect_class.Model(), names, True)  # type: ignore[call-arg]
+    return effect_class(effect_class.Model(), skips_unrated=True)  # type: ignore[call-arg]
 
 
 def effect_modules(effects: Iterable[base.Effect[Any]]) -> tuple[str, ...]:

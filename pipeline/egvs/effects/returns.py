@@ -49,7 +49,9 @@ class ReturnProbability:
         """Whether a beam counts by its probability where the span of points is measured, not fully."""
         return any(effect.THINS_SPANS for effect in self.effects)
 
-    def __call__(self, range_m: FloatArray, reflectivity: FloatArray | None = None) -> FloatArray:
+    def __call__(
+        self, range_m: FloatArray, reflectivity: FloatArray | None = None, of_class: FloatArray | None = None
+    ) -> FloatArray:
         """Return the probability that a return is detected, (n,) float64, 0 to 1.
 
         Parameters
@@ -58,6 +60,9 @@ class ReturnProbability:
             Range of each target, (n,) float64.
         reflectivity
             Reflectivity of each target, (n,) float64; by default that of cars.
+        of_class
+            Where targets are not whole road users: reflectivity of the class of the road user that each is a part of,
+            (n,) float64, NaN for the static world.
 
         Raises
         ------
@@ -66,7 +71,7 @@ class ReturnProbability:
         """
         detected = np.ones(len(range_m))
         for effect in self.effects:
-            shares = effect.detect_surface(range_m, self.sensor, reflectivity)
+            shares = effect.detect_surface(range_m, self.sensor, reflectivity, of_class)
             detected = detected * checked_shares(effect, shares, len(range_m), "ranges")
         return detected
 

@@ -37,9 +37,14 @@ class RangeLimitParameters(EffectParameters):
     """Losses of returns by range and reflectivity, and a constant share; each key replaces the value of all sensors."""
 
     reflectivity: float | None = Field(
-        None, gt=0, description="Reflectivity of all targets. By default that of each class of road users: 0.03"
+        None, gt=0, description="Reflectivity of all road users. By default that of each class: 0.03"
     )
-    incidence_deg: float = Field(0.0, ge=0, lt=90, description="Angle between the beam and the normal of the target")
+    incidence_deg: float = Field(
+        0.0,
+        ge=0,
+        lt=90,
+        description="Angle between the beam and the normal of road users, besides that in reflectivity",
+    )
     softness: float | None = Field(
         None, ge=0, description="Standard deviation of the logarithm of the received power. By default each sensor's"
     )

@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.effects.returns import ReturnProbability
 from egvs.scoring.blindspots import CELL_M, blindspot_map_shape
-from egvs.scoring.targets import SEEN_WELL_POINTS, ByRange, TargetRecord, visible_targets
+from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.traffic.network import Lane, Network, is_carriageway
 
@@ -136,7 +137,7 @@ class TargetPositions:
     def _record(self) -> TargetRecord:
         return TargetRecord.alone(self.boxes, self.target.kind, self.grid)
 
-    def points_map(self, beams: Beams, return_probability: ByRange | None = None) -> PointsMap:
+    def points_map(self, beams: Beams, return_probability: ReturnProbability | None = None) -> PointsMap:
         """Return the points at each square, the fewest where several boxes stand on it.
 
         Parameters

@@ -35,7 +35,7 @@ centre.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -59,9 +59,6 @@ if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 Floats = FloatArray
-
-ByRange = Callable[[FloatArray], FloatArray]
-"""Probability (n,) by range (n,), in metres."""
 
 SEEN_WELL_POINTS = 20.0
 """n0: the gain of a vehicle with this many points is 63 %, with three times as many 95 %."""
@@ -405,7 +402,9 @@ class VisibleTargets(TargetVisibility):
     sensor_m: FloatArray
 
 
-def visible_targets(record: TargetRecord, beams: Beams, return_probability: ByRange | None = None) -> VisibleTargets:
+def visible_targets(
+    record: TargetRecord, beams: Beams, return_probability: ReturnProbability | None = None
+) -> VisibleTargets:
     """Return what a site sees of the vehicle-frames of a record.
 
     Parameters
@@ -415,8 +414,7 @@ def visible_targets(record: TargetRecord, beams: Beams, return_probability: ByRa
     beams
         The site's empty scan.
     return_probability
-        Probability that a return from each range (n,) is detected; 1 where it is None. With losses, a
-        :class:`egvs.effects.returns.ReturnProbability`, which also depends on the reflectivity of each vehicle.
+        Probability that a return is detected, by its range and the reflectivity of the vehicle; None: every return is.
     """
     row, boxes = record.row, record.all_boxes.values[record.row]
     yaw_rad = boxes[:, 3]
@@ -428,10 +426,8 @@ def visible_targets(record: TargetRecord, beams: Beams, return_probability: ByRa
 
     hits = _count_points(record, sensor_m, beams, return_probability)
     points_alone = hits.alone[row]
-    if isinstance(return_probability, ReturnProbability):
+    if return_probability is not None:
         points_alone = points_alone * return_probability(range_m, record.reflectivity)
-    elif return_probability is not None:
-        points_alone = points_alone * return_probability(range_m)
     bounds_m, slices = np.stack([hits.low[row], hits.high[row]], axis=1), hits.slices[row]
     misses = hits.misses
     spans, hole_m = spans_and_holes(record, bounds_m, slices, misses)
@@ -564,13 +560,13 @@ NO_LOSSES = Losses(np.empty((0, 0)), _NO_ROWS, 1.0, _NO_ROWS, _NO_MISSES)
 
 
 def _count_points(
-    record: TargetRecord, sensor_m: FloatArray, site: Beams, return_probability: ByRange | None
+    record: TargetRecord, sensor_m: FloatArray, site: Beams, return_probability: ReturnProbability | None
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
-    losses, has_losses = NO_LOSSES, isinstance(return_probability, ReturnProbability) and return_probability.thins_spans
+    losses, has_losses = NO_LOSSES, return_probability is not None and return_probability.thins_spans
     is_counted = site.weight is None and (return_probability is None or has_losses)
     beams = sort_beams(site, _BANDS if is_counted else 1)
-    if isinstance(return_probability, ReturnProbability) and has_losses:
+    if return_probability is not None and has_losses:
         losses = Losses.of(record, return_probability, float(beams.length_m.max(initial=0.0)))
         return_probability = None
     is_target = np.zeros(count, dtype=np.bool_)

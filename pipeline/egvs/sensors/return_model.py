@@ -6,20 +6,20 @@ r"""Losses of returns: the probability that a sensor detects the return of a pul
 :math:`r_0` is the sensor's rated range for a target of reflectivity :math:`\rho_0` (data sheet), :math:`s` its softness
 and :math:`d` its dropout; :math:`\rho` is the reflectivity of the target. The power of a return from a diffuse surface
 that is larger than the beam's footprint is proportional to :math:`\rho \cos\theta / r^2` (Höfle and Pfeifer 2007, ISPRS
-J. Photogramm. Remote Sens. 62(6), 415-433); its logarithm is normally distributed about that, because it is a sum of
-many terms: paint, incidence, gloss, alignment, gain. :math:`\Phi` is the normal distribution.
+J. Photogramm. Remote Sens. 62(6), 415-433); its logarithm is assumed to be normally distributed about that, as a sum of
+many terms: paint, incidence, gloss, alignment, gain. :math:`\Phi` is the normal distribution. The fitted reflectivity
+of road users contains the incidence at which pulses meet them, so their :math:`\theta` is 0 unless a scenario sets it.
 
 **Where the defaults are from.** One setting, :math:`\rho = 0.03`, :math:`s = 1`, :math:`d = 0.05`, with the rated
 ranges of the data sheets (55 m and 200 m at 10 %), makes the simulated points on cars 0.92 and 1.08 times the measured
 ones of two units, an Ouster OS1-64 and a Hesai Pandar64; without losses they are 2.96 and 1.15 times as many. It was
 fitted on these two units, at one junction each, so the agreement is no test of it. Apart from each other, they give
-:math:`\rho` of 0.03 and 0.05, hence :data:`REFLECTIVITY_INTERVAL`; and :math:`s` of 1.0 and 2.2. A reflectivity of 0.03
-is that of a pulse on average: bodies of cars are glossy and mostly inclined, and much of the light leaves as from a
-mirror.
+:math:`\rho` of 0.030 and 0.052, and :math:`s` of 1.0 and 2.2. A reflectivity of 0.03 is that of a pulse on average:
+bodies of cars are glossy and mostly inclined, and much of the light leaves as from a mirror.
 
-**When losses are simulated.** Where more than :data:`NEGLIGIBLE_LOSS` of the returns are lost by range at the point of
-the region that is farthest from a site of the sensor, and within its range (:func:`decide_losses`). Elsewhere neither
-the loss by range nor the dropout is simulated.
+**When losses are simulated.** If, for any sensor, more than :data:`NEGLIGIBLE_LOSS` of the returns are lost by range at
+the point of the region that is farthest from a site of it, and within its range, losses of all sensors are simulated
+(:func:`decide_losses`). Otherwise neither the loss by range nor the dropout is.
 
 Reflectivities of classes of road users, with their sources, are in ``reflectivity.toml`` beside this module.
 """
@@ -50,11 +50,14 @@ CAR = "car"
 """The class whose reflectivity was fitted, and that of targets of no known class."""
 
 REFLECTIVITY_INTERVAL = (0.03, 0.06)
-"""Reflectivities that two units give, each by itself: the interval of the default."""
+"""Assumed interval of the default. Two units give 0.030 and 0.052, the second with a standard error of 0.026."""
 
 GLASS_RATIO = 0.75
 """Reflectivity of windows over that of the whole vehicle: the OS1-64 loses 71 % of the pulses that meet windows of cars
-and 61 % of all that meet cars, which is 0.28 standard deviations of the logarithm of power; exp(-0.28 s), s = 1."""
+and 61 % of all that meet cars, which is 0.28 standard deviations of the logarithm of power; exp(-0.28 s), s = 1.
+
+This is one unit. Of cars, it makes windows 0.68 times the rest of the body; the losses of an 80-beam unit on bright
+paint and windows (5 and 21 %, ``docs/validity.md``) imply about 0.43."""
 
 NEGLIGIBLE_LOSS = 0.05
 """Losses by range are simulated if they are larger than this anywhere in the region; the fit leaves 0.1."""
@@ -74,7 +77,7 @@ class RoadUserClass:
     reflectivity
         Median over all pulses that meet it, windows included.
     interval
-        Lowest and highest value that the evidence allows.
+        Assumed interval.
     glass_share
         Share of its silhouette that is windows.
     source
@@ -139,9 +142,9 @@ class ReturnModel:
     dropout
         Share of the returns that are lost at any range.
     reflectivity
-        Reflectivity of all targets; None for that of each class.
+        Reflectivity of all road users; None for that of each class.
     incidence_deg
-        Angle between the beam and the normal of the target.
+        Angle between the beam and the normal of road users, in addition to what their reflectivity contains.
 
     Examples
     --------
@@ -184,15 +187,36 @@ class ReturnModel:
         )
 
     def target_reflectivity(self, vclass: str | None = None) -> float:
-        """Return the reflectivity of a road user of a SUMO vClass; by default, of a car."""
+        """Return the reflectivity of a road user of a SUMO vClass, by default a car, times the cosine of incidence."""
         if self.reflectivity is not None:
-            return self.reflectivity
-        return road_user_classes()[CAR].reflectivity if vclass is None else class_of(vclass).reflectivity
+            return self.reflectivity * self._cosine
+        return self._cosine * (road_user_classes()[CAR] if vclass is None else class_of(vclass)).reflectivity
+
+    def surface_reflectivity(self, reflectivity: FloatArray, of_class: FloatArray | None = None) -> FloatArray:
+        """Return the reflectivity of surfaces as the scenario sets that of road users, (n,) float64.
+
+        Parameters
+        ----------
+        reflectivity
+            Reflectivity of each surface without what the scenario sets, (n,) float64.
+        of_class
+            Reflectivity of the class of its road user, (n,) float64: parts, such as windows, keep their ratio to it.
+            NaN for the static world, which stays as it is; by default, surfaces are whole road users.
+        """
+        if of_class is None:
+            of_class = reflectivity
+        changed = reflectivity * self._cosine
+        if self.reflectivity is not None:
+            changed = self.reflectivity * self._cosine * (reflectivity / of_class)
+        return np.where(np.isnan(of_class), reflectivity, changed)
+
+    @property
+    def _cosine(self) -> float:
+        return float(cosdg(self.incidence_deg)) if self.incidence_deg else 1.0
 
     def limit_m(self, reflectivity: float) -> float:
         """Return the range at which a target is detected with a probability of 1/2, apart from dropout, metres."""
-        cosine = float(cosdg(self.incidence_deg)) if self.incidence_deg else 1.0
-        return self.rated_range_m * math.sqrt(reflectivity * cosine / self.rated_reflectivity)
+        return self.rated_range_m * math.sqrt(reflectivity / self.rated_reflectivity)
 
     def probability(self, range_m: FloatArray, reflectivity: float | FloatArray | None = None) -> FloatArray:
         """Return the probability that a return is detected, (n,) float64, 0 to 1.
@@ -228,9 +252,9 @@ class LossDecision:
     ----------
     acting
         Sensors with losses, by name: the farthest point of the region in reach, and the range up to which losses are
-        negligible, metres.
+        negligible, metres. Those of one that does not need them act if those of another do, so that all have the same.
     negligible
-        The same of sensors whose losses cannot matter.
+        The same where no sensor needs losses.
     unrated
         Sensors without a rated range.
     """
@@ -251,16 +275,19 @@ class LossDecision:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was decided: a line for sensors with losses, and one for sensors without a rated range."""
+        """What was decided: lines for sensors with losses, and for each without a rated range."""
         notes = []
         if self.acting:
-            reach_m = max(reach for reach, _ in self.acting.values())
-            listed = ", ".join(f"{name} ({limit:.0f} m)" for name, (_, limit) in self.acting.items())
+            needing = {name: values for name, values in self.acting.items() if values[0] > values[1]}
+            reach_m = max(reach for reach, _ in needing.values())
+            listed = ", ".join(f"{name} ({limit:.0f} m)" for name, (_, limit) in needing.items())
             notes.append(
                 f"losses of returns are simulated for {listed}: the region reaches to {reach_m:.0f} m, farther than "
                 f"the range in brackets, where {format_percent(NEGLIGIBLE_LOSS, 0)} are lost (effects.range_limit = "
                 "false: off)"
             )
+            if others := [name for name in self.acting if name not in needing]:
+                notes.append(f"losses of returns are simulated for {', '.join(others)}, too: for all sensors or none")
         for name in self.unrated:
             notes.append(
                 f"losses of returns are not simulated for {name}, which has no rated range: every return is assumed to "
@@ -270,7 +297,10 @@ class LossDecision:
 
 
 def decide_losses(sites: Iterable[Site], sensors: Mapping[str, Sensor], roi: Roi) -> LossDecision:
-    """Decide by rated ranges and distances in the region which sensors need losses of returns.
+    """Decide by rated ranges and distances in the region whether sensors need losses of returns.
+
+    If any needs them, all with a rated range have them: a sensor that loses nothing would gain on the others by its
+    dropout.
 
     Parameters
     ----------
@@ -288,8 +318,7 @@ def decide_losses(sites: Iterable[Site], sensors: Mapping[str, Sensor], roi: Roi
         farthest = np.maximum(np.abs(position - low), np.abs(position - low - size))
         reach_m[site.sensor] = max(reach_m.get(site.sensor, 0.0), math.sqrt(float((farthest**2).sum())))
 
-    acting: dict[str, tuple[float, float]] = {}
-    negligible: dict[str, tuple[float, float]] = {}
+    rated: dict[str, tuple[float, float]] = {}
     unrated = []
     for name, distance_m in reach_m.items():
         sensor = sensors[name]
@@ -297,6 +326,7 @@ def decide_losses(sites: Iterable[Site], sensors: Mapping[str, Sensor], roi: Roi
             unrated.append(name)
             continue
         limit_m = ReturnModel.of(sensor).lossless_range_m
-        within_m = min(distance_m, sensor.range_m)
-        (acting if within_m > limit_m else negligible)[name] = within_m, limit_m
-    return LossDecision(acting, negligible, tuple(unrated))
+        rated[name] = min(distance_m, sensor.range_m), limit_m
+    if any(reach_m > limit_m for reach_m, limit_m in rated.values()):
+        return LossDecision(rated, {}, tuple(unrated))
+    return LossDecision({}, rated, tuple(unrated))

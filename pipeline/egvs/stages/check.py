@@ -46,6 +46,7 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     scene_checks.warn_repeated_beams,
     scene_checks.warn_odd_beams,
     scene_checks.check_effects,
+    scene_checks.warn_losses,
     scene_checks.check_poses,
     scene_checks.warn_radians,
     scene_checks.warn_nose_up,

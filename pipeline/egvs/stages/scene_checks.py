@@ -29,7 +29,7 @@ from egvs.sensors import sensor, site_feasibility
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.sites import Site
-from egvs.stages import solid_readings
+from egvs.stages import scene_inputs, solid_readings
 from egvs.stages.inputs import CheckInputs, ErrorCollector
 from egvs.traffic import sumo_folder
 from egvs.traffic.network import Network
@@ -174,6 +174,30 @@ def _effect_errors(effect: Effect[Any], scene: Scene) -> Iterator[Diagnostic]:
     error = effect.refusal(scene)
     if error is not None:
         yield Diagnostic.of("effects", error)
+
+
+def warn_losses(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about losses of returns that act twice, and about rated ranges that do not say for which reflectivity."""
+    scenario, config = inputs.scenario, inputs.scenario.effects.range_limit
+    if config is False:
+        return
+    if "surface_losses" in scenario.effects.named:
+        decision = scene_inputs.scenario_losses(scenario, inputs.sites)
+        if decision is None or decision.acting:
+            problem = "dark vehicles and windows are part of the losses of returns too: clouds lose these returns twice"
+            hint = "Set effects.range_limit = false, or remove surface_losses."
+            yield Diagnostic("losses twice", f"{scenario.file}: effects.surface_losses", problem, hint)
+
+    if config is not None and config.rated_reflectivity is not None:
+        return
+    for name in sorted({site.sensor for site in inputs.sites} & set(scenario.sensors)):
+        custom = scenario.sensors[name]
+        rated_range_m = (config and config.rated_range_m) or custom.rated_range_m
+        if rated_range_m is not None and "rated_reflectivity" not in custom.model_fields_set:
+            share = format_percent(custom.rated_reflectivity, 0)
+            problem = f"rated_reflectivity is missing: {rated_range_m:g} m are taken as rated for a target of {share}"
+            hint = "Enter that of the data sheet, often 0.1."
+            yield Diagnostic("rated range", f"{scenario.file}: sensors.{name}", problem, hint)
 
 
 MAX_LISTED_SITES = 8

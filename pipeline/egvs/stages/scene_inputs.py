@@ -85,7 +85,7 @@ def with_effects(plain: Scene) -> Scene:
     candidates = (*plain.sites, *(site for site, _ in plain.dropped))
     losses = scenario_losses(plain.scenario, candidates)
     if losses is not None and losses.acting:
-        active.append(registry.make_losses(losses.acting))
+        active.append(registry.make_losses())
     for effect in registry.scenario_effects(plain.scenario, "scan", "score", "clouds"):
         reason = effect.why_idle(plain)
         if reason is None:
@@ -103,7 +103,7 @@ def with_losses_of_all(scene: Scene) -> Scene:
     if scene.losses is None:
         return scene
     others = tuple(effect for effect in scene.effects if effect.NAME != registry.LOSSES)
-    return replace(scene, effects=(registry.make_losses(None), *others))
+    return replace(scene, effects=(registry.make_losses(), *others))
 
 
 def scenario_losses(scenario: Scenario, candidates: Sequence[Site]) -> LossDecision | None:

@@ -21,6 +21,7 @@ from egvs.scoring.visibility import Beams
 from egvs.sensors import sensor
 from egvs.sensors.sites import Pose
 from tests.clouds.cloud_scenes import frame_of, random_frame
+from tests.scoring.target_scenes import by_range
 
 GRID = Grid((0.0, 0.0, 0.0), 0.5, (20, 8, 4))  # 10 m x 4 m x 2 m
 
@@ -192,7 +193,7 @@ def test_points_are_those_that_are_counted(lost):
     ends = sensor.CATALOGUE["VLP-16"].directions() * 40.0
     beams = Beams(Pose(-5.0, 3.0, 4.0), sensor.CATALOGUE["VLP-16"], ends)
     seen = visible_targets(record, beams)
-    probability = (lambda r: (r < 15.0).astype(np.float64)) if lost else None
+    probability = by_range(lambda r: (r < 15.0).astype(np.float64)) if lost else None
     points = list_target_points(record, beams, probability)
     counts = np.bincount(points.vehicle, minlength=len(record))
     if lost:

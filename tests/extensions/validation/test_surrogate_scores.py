@@ -26,6 +26,7 @@ from egvs.extensions.validation.surrogates import Occupancy, SiteEvidence
 from egvs.scoring.visibility import Beams
 from egvs.sensors import sensor
 from egvs.sensors.sites import Pose
+from tests.scoring.target_scenes import by_range
 
 LN2 = math.log(2.0)
 H_QUARTER = 2.0 - 0.75 * math.log2(3.0)  # H(1/4) = 1/4 * 2 + 3/4 * (2 - log2 3), in bits
@@ -170,9 +171,8 @@ def test_density_is_points_per_road_area():
     assert value("density", road(list(OFF.values()))) == 0.0
     assert value("density", road(list(AT.values()), returned=[True, False, True, True])) == pytest.approx(3 / 1.5)
     assert value("density", road(list(AT.values()), weight=np.array([0.5, 1, 1, 1]))) == pytest.approx(3.5 / 1.5)
-    assert value("density", road(list(AT.values()), detection_probability=lambda r: 0 * r + 0.25)) == pytest.approx(
-        1 / 1.5
-    )
+    quarter = by_range(lambda r: 0 * r + 0.25)
+    assert value("density", road(list(AT.values()), detection_probability=quarter)) == pytest.approx(1 / 1.5)
 
 
 def test_uniformity_is_spread_of_density_over_squares():

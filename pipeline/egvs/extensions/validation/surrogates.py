@@ -105,11 +105,6 @@ class SurrogateScore:
 # ---- evidence
 
 
-def always_detected(range_m: FloatArray) -> FloatArray:
-    """Return a detection probability of 1 for a return from any range."""
-    return np.ones(len(range_m))
-
-
 @dataclass(frozen=True, eq=False)
 class Occupancy:
     """A TPOG and the quantities that scores derive from it.
@@ -174,7 +169,7 @@ class SiteEvidence:
     count_points
         Counts the points on vehicles.
     detection_probability
-        Returns the probability that a return from each range (n,) is detected.
+        The probability that returns are detected; None: all are.
     """
 
     occupancy: Occupancy
@@ -182,7 +177,7 @@ class SiteEvidence:
     returned: NDArray[np.bool_]
     count_hits: Callable[[Beams], tuple[Hits, int]]
     count_points: Callable[[Beams], VisibleTargets]
-    detection_probability: Callable[[FloatArray], FloatArray] = always_detected
+    detection_probability: ReturnProbability | None = None
 
     @cached_property
     def hit_counts(self) -> tuple[Hits, int]:
@@ -214,8 +209,9 @@ class SiteEvidence:
         ends_m = self.beams.ends_m[self.returned]
         weight = np.ones(len(ends_m)) if self.beams.weight is None else self.beams.weight[self.returned]
         sensor_m = self.occupancy.tpog.grid.to_grid_m(np.asarray(self.beams.pose.position_m))
-        range_m = np.sqrt((ends_m**2).sum(axis=1))
-        return sensor_m + ends_m, weight * self.detection_probability(range_m)
+        if self.detection_probability is not None:
+            weight = weight * self.detection_probability(np.sqrt((ends_m**2).sum(axis=1)))
+        return sensor_m + ends_m, weight
 
     @cached_property
     def vehicles(self) -> VisibleTargets:
@@ -589,9 +585,7 @@ class _PreparedScenario:
                     self._visible_targets[site] = targets.visible_targets(record, beams, probability)
                 return self._visible_targets[site]
 
-            evidence = SiteEvidence(
-                occupancy, scan.beams, returned, count_hits, count_points, probability or always_detected
-            )
+            evidence = SiteEvidence(occupancy, scan.beams, returned, count_hits, count_points, probability)
             return _score_site(site, evidence, tasks)
 
         scans = zip(empty_scans(context), _returned_beams(context), strict=True)

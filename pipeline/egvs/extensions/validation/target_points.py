@@ -13,7 +13,7 @@ import numpy as np
 from egvs.core.grid import FloatArray, IntArray
 from egvs.effects.returns import ReturnProbability
 from egvs.kernels import vehicle_visibility
-from egvs.scoring.targets import MAX_HITS, NO_LOSSES, ByRange, TargetRecord, sort_beams
+from egvs.scoring.targets import MAX_HITS, NO_LOSSES, TargetRecord, sort_beams
 from egvs.scoring.visibility import Beams
 
 
@@ -36,7 +36,9 @@ class TargetPoints(NamedTuple):
     probability: FloatArray
 
 
-def list_target_points(record: TargetRecord, beams: Beams, return_probability: ByRange | None = None) -> TargetPoints:
+def list_target_points(
+    record: TargetRecord, beams: Beams, return_probability: ReturnProbability | None = None
+) -> TargetPoints:
     """Return the points of one site on the vehicle-frames of a record, with occlusion by all other boxes.
 
     Parameters
@@ -68,10 +70,8 @@ def list_target_points(record: TargetRecord, beams: Beams, return_probability: B
         )
         box, beam, range_m, along_m, across_m = (column[:filled] for column in hits)
         probability = ordered.weight[beam]
-        if isinstance(return_probability, ReturnProbability):
+        if return_probability is not None:
             probability = probability * return_probability(range_m, record.reflectivity[row_of_box[box]])
-        elif return_probability is not None:
-            probability = probability * return_probability(range_m)
         is_point = probability > 0.0
         box, beam, range_m = box[is_point], beam[is_point], range_m[is_point]
         from_centre_m = sensor_m + range_m[:, None] * ordered.directions[:, beam].T - boxes.values[box, :3]

@@ -13,15 +13,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
+from egvs.core.grid import IntArray
+from egvs.effects.registry import make_losses
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.validation.measured.comparison import (
     Comparison,
     ComparisonRequest,
     compare_labelled,
+    visible_boxes,
 )
 from egvs.extensions.validation.measured.ratios import ratio_of_sums
+from egvs.extensions.validation.measured.return_fit import ReturnFit, fit_returns
 from egvs.extensions.validation.measured.tables import fitted_table, sentences
 from egvs.scenario.sensor_config import SensorConfig
+from egvs.scoring.targets import visible_targets
+from egvs.scoring.visibility import Beams
 from egvs.sensors.return_model import ReturnModel
 from egvs.sensors.sensor import CATALOGUE
 from tests.extensions.validation.measured import twin
@@ -30,6 +38,8 @@ from tests.extensions.validation.measured.twin import SENSOR
 TUMTRAF = Path(__file__).parents[5] / "shared" / "real" / "tumtraf"
 
 DEFAULT = ReturnModel.of(CATALOGUE[SENSOR])
+CARS_AT_M = (25.0, 33.0, 42.0, 55.0)
+
 LOSSES = replace(DEFAULT, rated_range_m=75.0, softness=0.8)
 """The losses of the twin; the sensor of the catalogue has other ones."""
 
@@ -114,6 +124,41 @@ def test_levels_have_both_numbers(compared: Comparison) -> None:
     assert cars.detectors["sensor"].value < cars.detectors["fitted"].value < cars.detectors["none"].value
     assert cars.people["sensor"].value < cars.people["none"].value
     assert 0.0 < cars.people["measured"].value < 1.0
+
+
+def test_boxes_are_seen_as_in_a_run_with_the_same_sensor(compared: Comparison) -> None:
+    """With losses, points reach less far over a vehicle, and the stretches without points are longer."""
+    site, count = compared.site, len(CARS_AT_M)
+    boxes = np.array([(x, 0.5, 0.75, *twin.CAR_M, 0.4) for x in CARS_AT_M])
+    frame = TrafficFrame(0, tuple("abcd"), ("passenger",) * count, boxes, np.zeros(count))
+    there, without = (visible_boxes(site, [frame], model) for model in (compared.model, None))
+    beams = Beams(site.pose, site.sensor, site.range_m[:, None] * site.directions)
+    scored = visible_targets(there.record, beams, ReturnProbability((make_losses(),), site.sensor))
+    for name in ("points", "points_alone", "length_share", "width_share", "hole_m"):
+        np.testing.assert_array_equal(getattr(there, name), getattr(scored, name), err_msg=name)
+    far = slice(1, None)  # the first has so many points that none of its extent is lost
+    assert (there.length_share < without.length_share)[far].all() and (there.hole_m > without.hole_m)[far].all()
+
+
+def test_returns_that_no_range_loses_have_no_fit() -> None:
+    """If all beams return, more than the dropout lets, the best limit is the last that is tried: no estimate."""
+    rng, per_car = np.random.default_rng(1), 200
+    owner = np.repeat(np.arange(10), per_car)
+    range_m, weight = rng.uniform(15.0, 60.0, len(owner)), np.ones(len(owner))
+
+    def fit(measured: IntArray) -> ReturnFit | None:
+        return fit_returns(measured, owner, range_m, weight, np.arange(10), DEFAULT)
+
+    assert fit(np.full(10, per_car)) is None
+    with_losses = fit(np.bincount(owner, DEFAULT.probability(range_m, 0.03)).round().astype(np.int64))
+    assert with_losses is not None and with_losses.limit_m == pytest.approx(DEFAULT.limit_m(0.03), rel=0.02)
+
+
+def test_comparison_says_that_the_limit_is_beyond_what_is_tried(tmp_path: Path) -> None:
+    sweeps = twin.make_twin(None, seed=3, sweeps=1, cars=8)
+    comparison = write_and_compare(tmp_path, twin.write_openlabel(tmp_path, sweeps), sweeps)
+    assert comparison.fit is None
+    assert any("beyond the tried 4 to 600 m" in note for note in comparison.notes)
 
 
 def write_and_compare(folder: Path, labels: list[Path], sweeps: twin.Twin, **options: object) -> Comparison:

@@ -28,6 +28,8 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.simulation import BodyCaster, VehicleMeshes, builtin_bodies
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.effects.range_limit import RangeLimit
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.validation.detectors.base import make_detector
 from egvs.extensions.validation.measured import return_fit, sensor_site, yaw_conventions
 from egvs.extensions.validation.measured.box_points import BOTTOM_M, points_in_boxes
@@ -173,7 +175,7 @@ class Comparison:
     model
         Losses of the sensor as it is; None without a rated range.
     fit
-        Losses fitted to cars; None with too few of them, or without a rated range.
+        Losses fitted to cars; None with too few of them, beyond the tried values, or without a rated range.
     levels
         By group of road users.
     detections
@@ -358,7 +360,8 @@ def visible_boxes(site: SensorSite, frames: Sequence[TrafficFrame], model: Retur
     record = TargetRecord.of(list(frames), grid, PEOPLE)
     weight = None if (site.weight == 1.0).all() else site.weight
     beams = Beams(site.pose, site.sensor, site.range_m[:, None] * site.directions, weight)
-    return visible_targets(record, beams, None if model is None else model.probability)
+    losses = None if model is None else ReturnProbability((RangeLimit.of(model),), site.sensor)
+    return visible_targets(record, beams, losses)
 
 
 def _count_points(
@@ -543,6 +546,12 @@ def _few_objects(
         )
     if model is None:
         notes.append("The sensor has no rated range, so no losses are simulated or fitted: add rated_range_m.")
+    elif fit is None and objects >= return_fit.MIN_OBJECTS and points.measured[cars].any():
+        low_m, high_m = return_fit.LIMITS_M[[0, -1]]
+        notes.append(
+            f"Losses are not fitted: the points on cars put the range at which half of the returns are lost beyond "
+            f"the tried {low_m:.0f} to {high_m:.0f} m."
+        )
     elif fit is None:
         notes.append(f"Losses are not fitted: expected at least {return_fit.MIN_OBJECTS} different cars with points.")
     return notes

@@ -36,7 +36,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import ndtr
 from egvs.core.wording import format_percent
-from egvs.extensions.validation.measured.return_fit import LIMITS_M, minima_of_limit
+from egvs.extensions.validation.measured.return_fit import LIMITS_M, is_tried, minima_of_limit
 from egvs.extensions.validation.measured.sensor_site import SensorSite
 from egvs.formats.sweep_files import Sweep
 from egvs.sensors.sensor import rotation_world_sensor
@@ -100,7 +100,7 @@ class GroundFit:
 
 @dataclass(frozen=True)
 class Repetition:
-    """Repetition of static returns by range, and the fit on the ground; None with too few returns there."""
+    """Repetition of static returns by range, and the fit on the ground; None where that shows no range."""
 
     site: SensorSite
     sweeps: tuple[str, ...]
@@ -168,7 +168,7 @@ def repeated_returns(
 
 
 def _fit_ground(site: SensorSite, points_m: FloatArray, repeated: NDArray[np.bool_]) -> GroundFit | None:
-    """Return the rated range by the returns of some that are from the ground; None with too few of them."""
+    """Return the rated range by the returns of some that are from the ground; None if they do not show it."""
     up = rotation_world_sensor(*site.pose.angles_deg)[2]
     ground = np.abs(points_m @ up + site.pose.z_m) < ON_GROUND_M
     if ground.sum() < MIN_GROUND_RETURNS:
@@ -180,6 +180,8 @@ def _fit_ground(site: SensorSite, points_m: FloatArray, repeated: NDArray[np.boo
     sector = np.unique(np.floor(azimuth_deg / _SECTOR_DEG), return_inverse=True)[1].astype(np.int64)
     deviance = _deviances(distance_m, repeated, sector)
     log_limit, left_out = minima_of_limit(deviance.sum(axis=0), deviance)
+    if not is_tried(math.exp(log_limit)):
+        return None
     se = math.sqrt(float(jackknife_variance(left_out)))
     scale = math.sqrt(site.sensor.rated_reflectivity / REFLECTIVITY["ground"])
     return GroundFit(math.exp(log_limit) * scale, se, len(range_m))

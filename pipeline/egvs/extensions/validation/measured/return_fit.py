@@ -88,7 +88,7 @@ class ReturnFit:
 def fit_returns(
     measured: IntArray, owner: IntArray, range_m: FloatArray, weight: FloatArray, objects: IntArray, model: ReturnModel
 ) -> ReturnFit | None:
-    """Return the fit; None with fewer than :data:`MIN_OBJECTS` objects.
+    """Return the fit; None with fewer than :data:`MIN_OBJECTS` objects, or with a limit beyond :data:`LIMITS_M`.
 
     Parameters
     ----------
@@ -125,8 +125,15 @@ def fit_returns(
         limit_se = math.sqrt(float(jackknife_variance(without)))
         softness, softness_se = float(SOFTNESSES[row]), 0.0
     limit = math.exp(log_limit)
+    if not is_tried(limit):
+        return None
     rated_m = limit / model.limit_m(model.target_reflectivity()) * model.rated_range_m
     return ReturnFit(limit, limit_se, softness, softness_se, model.dropout, rated_m, len(measured), len(numbers))
+
+
+def is_tried(limit_m: float) -> bool:
+    """Return whether a limit is among :data:`LIMITS_M`; beyond, Newton's step is no estimate."""
+    return bool(LIMITS_M[0] < limit_m < LIMITS_M[-1])
 
 
 def _expected_points(range_m: FloatArray, weight: FloatArray) -> FloatArray:

@@ -185,7 +185,7 @@ def repetition_sentences(repetition: Repetition) -> Iterator[str]:
     yield from repetition.site.assumptions[:1]
     sensor, fit = repetition.site.sensor, repetition.fit
     if fit is None:
-        yield "Too few returns are from the ground to fit the rated range."
+        yield "The rated range is not fitted: too few returns are from the ground, or they show no limit."
     else:
         low_m, high_m = fit.interval_m
         yield (
