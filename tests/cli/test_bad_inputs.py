@@ -193,24 +193,24 @@ BAD: dict[str, tuple[Change, str]] = {
     # sites and sensors
     "sites missing": (remove("sites.csv"), r"sites.file = 'sites.csv': no such file"),
     "sites empty": (put("sites.csv", "site,x_m,y_m,z_m\n"), r"sites.csv: expected at least one site"),
-    "sites without z": (sites("a,1,12", head="site,x_m,y_m"), r"row a: z_m is missing"),
-    "sites with text": (sites("a,1,north,3"), r"row a: y_m: .*finite number.*'north'"),
+    "sites without z": (sites("a,1,12", head="site,x_m,y_m"), r"line 2 \(a\): z_m is missing"),
+    "sites with text": (sites("a,1,north,3"), r"line 2 \(a\): y_m: .*finite number.*'north'"),
     "sites with a misspelt column": (
         sites("a,1,12,3,9", head="site,x_m,y_m,z_m,yaw_dge"),
-        r"row a: unknown column 'yaw_dge'\. Did you mean yaw_deg\?",
+        r"line 2 \(a\): unknown column 'yaw_dge'\. Did you mean yaw_deg\?",
     ),
     "sites with a column without a name": (
         sites("0,a,1,12,3", head=",site,x_m,y_m,z_m"),
-        r"expected a column name .*, got ''",
+        r"header: column 1 has no name, but line 2 has the value '0' there. Name or remove the column",
     ),
     "sites with semicolons": (
-        put("sites.csv", "site;x_m;y_m;z_m\na;1,5;12;3\n"),
-        r"sites.csv: the columns are separated by ';'. Use commas, and decimal points in the numbers",
+        put("sites.csv", "site;x_m;y_m;z_m\na;1,500;12;3\n"),
+        r"sites.csv: line 2: x_m: 1,500 can mean 1500 or 1.500. Use no separators of thousands",
     ),
-    "sites with tabs": (put("sites.csv", "site\tx_m\ty_m\tz_m\n"), r"sites.csv: the columns are separated by '\\t'"),
-    "sites ragged": (sites("a,1,12"), r"row a: .*more or fewer values"),
+    "sites with bars": (put("sites.csv", "site|x_m|y_m|z_m\n"), r"sites.csv: the columns are separated by '\|'"),
+    "sites ragged": (sites("a,1,12"), r"line 2: expected 4 values, got 3"),
     "site twice": (sites("a,1,12,3", "a,2,12,3"), r"there are two sites 'a'"),
-    "site NaN": (sites("a,nan,12,3"), r"row a: x_m: .*'nan'"),
+    "site NaN": (sites("a,nan,12,3"), r"line 2 \(a\): x_m: .*'nan'"),
     "site in a wall": (sites("a,16,6,3"), r"site a: \(16, 6, 3\) is inside house \(building\)"),
     "site below ground": (sites("a,1,12,-1"), r"site a: z_m = -1 is not above the ground"),
     "site too far": (sites("a,1,500,3"), r"site a: the site is 490.0 m from the region of interest"),
@@ -220,7 +220,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "pitch beyond 90": (
         sites("a,1,12,3,100", head="site,x_m,y_m,z_m,pitch_deg"),
-        r"row a: pitch_deg: .*between -90 and 90, got 100",
+        r"line 2 \(a\): pitch_deg: .*between -90 and 90, got 100",
     ),
     "azimuth step does not divide": (
         edit("azimuth_step_deg = 1.0", "azimuth_step_deg = 0.7"),
@@ -233,10 +233,10 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "site that would be a path": (
         sites("../../a,1,12,3"),
-        r"row ../../a: site: .*name of up to 80 characters.*'../../a'",
+        r"line 2 \(../../a\): site: .*name of up to 80 characters.*'../../a'",
     ),
-    "site beyond the Earth": (sites("a,1e300,12,3"), r"row a: x_m: .*finite number of at most .*'1e300'"),
-    "a column twice": (sites("a,1,12,3,2", head="site,x_m,y_m,z_m,x_m"), r"the column 'x_m' occurs twice"),
+    "site beyond the Earth": (sites("a,1e300,12,3"), r"line 2 \(a\): x_m: .*finite number of at most .*'1e300'"),
+    "a column twice": (sites("a,1,12,3,2", head="site,x_m,y_m,z_m,x_m"), r"two columns are called 'x_m'"),
     "too many beams": (
         edit("azimuth_step_deg = 1.0", "azimuth_step_deg = 1e-7"),
         r"8 rings every 1e-07 degrees make more than",

@@ -36,6 +36,21 @@ def test_rejects_invalid_toml(tmp_path: Path, text: str, message: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("error", "hint"),
+    [
+        (MemoryError(), "Use a smaller file, or a machine with more memory."),
+        (PermissionError(13, "Permission denied"), "Check the path and the permissions."),
+        (EOFError("ended"), reading.COMPLETE_FILE),
+        (OSError("Not a gzipped file"), reading.COMPLETE_FILE),
+    ],
+)
+def test_only_the_content_of_a_file_makes_it_incomplete(error: Exception, hint: str) -> None:
+    with pytest.raises(InputError) as translated, reading.translate_errors("a.bin"):
+        raise error
+    assert str(translated.value).startswith("a.bin: cannot be read (") and str(translated.value).endswith(hint)
+
+
+@pytest.mark.parametrize(
     ("data", "message"),
     [
         (DEEP.encode(), "nested too deeply"),

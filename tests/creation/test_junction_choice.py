@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from shapely.geometry import LineString, MultiLineString, Point
 
+from egvs.cli.new_summary import describe_streets
 from egvs.core.errors import InputError
 from egvs.creation import assumed_traffic
 from egvs.creation.new_scenario import NewScenario
@@ -140,6 +141,17 @@ def test_carriageways_of_divided_roads_are_one_arm_each(tmp_path: Path) -> None:
     assert (summary.junction.arms, summary.junction.lanes_in) == (4, 4)
 
 
+def test_lane_for_turning_belongs_to_the_arm_of_its_road(tmp_path: Path) -> None:
+    """Main Street has a lane of its own for right turns, from 90 m before the junction on; Lane meets it beside it."""
+    nodes = {1: (-300.0, 0.0), 2: (-90.0, 0.0), 3: (-60.0, -6.0), 4: (-20.0, -6.0), 5: (0.0, 0.0), 6: (300.0, 0.0)}
+    nodes |= {7: (0.0, -200.0), 8: (-50.0, 0.0), 9: (-50.0, 200.0)}
+    turning = street("", 2, 3, 4, 5, oneway="yes")
+    ways = [street("Main Street", 1, 2, 8, 5, 6), turning, street("Side Street", 5, 7), street("Lane", 8, 9)]
+    osm = write_map(tmp_path / "map.osm", nodes, ways, {5: {"highway": "traffic_signals"}})
+    summary = create_scenario(tmp_path / "out", osm, None)
+    assert (summary.junction.arms, summary.junction.lanes_in) == (3, 4)
+
+
 def test_road_that_becomes_divided_is_no_junction(tmp_path: Path) -> None:
     nodes = {1: (-300.0, 0.0), 2: (0.0, 0.0), 3: (30.0, 6.0), 4: (300.0, 6.0), 5: (30.0, -6.0), 6: (300.0, -6.0)}
     nodes |= {7: (-200.0, 0.0), 8: (-200.0, 150.0)}
@@ -165,14 +177,33 @@ def test_next_junctions_are_listed_with_the_option_that_chooses_them(tmp_path: P
     assert not again.region.other_junctions
 
 
-@pytest.mark.parametrize("access", [True, False])
-def test_network_with_at_most_one_end_has_traffic_through_the_junction(tmp_path: Path, access: bool) -> None:
+def test_second_carriageway_is_no_further_junction(tmp_path: Path) -> None:
+    """B Street meets both carriageways of A Street, 30 m apart; there are signals at both, and at a stop line."""
+    nodes = {1: (-300.0, 0.0), 2: (0.0, 0.0), 3: (300.0, 0.0), 4: (300.0, 30.0), 5: (0.0, 30.0), 6: (-300.0, 30.0)}
+    nodes |= {7: (0.0, -200.0), 8: (0.0, 200.0), 9: (-60.0, 0.0)}
+    ways = [
+        street("A Street", 1, 9, 2, 3, oneway="yes"),
+        street("A Street", 4, 5, 6, oneway="yes"),
+        street("B Street", 7, 2, 5, 8),
+    ]
+    signals = {node: {"highway": "traffic_signals"} for node in (2, 5, 9)}
+    summary = create_scenario(tmp_path / "out", write_map(tmp_path / "map.osm", nodes, ways, signals), None)
+    assert summary.junction.title == SIGNALISED
+    assert not summary.region.other_junctions
+    assert describe_streets(summary.streets).endswith(", 1 junction with signals")
+
+
+@pytest.mark.parametrize("access", ["road", "carriageways", "none"])
+def test_network_with_at_most_one_end_has_traffic_through_the_junction(tmp_path: Path, access: str) -> None:
     """A block of streets with a cross in its middle: 4 approaches with 3 turns each, with or without an access road."""
     nodes = {1: (0.0, 0.0), 2: (100.0, 0.0), 3: (-100.0, 0.0), 4: (0.0, 100.0), 5: (0.0, -100.0)}
     nodes |= {6: (100.0, 100.0), 7: (-100.0, 100.0), 8: (-100.0, -100.0), 9: (100.0, -100.0), 10: (250.0, 100.0)}
     ways = [street("East Street", 3, 1, 2), street("North Street", 4, 1, 5), street("Block", 6, 4, 7, 3, 8, 5, 9, 2, 6)]
-    if access:
+    if access == "road":
         ways.append(street("Access", 6, 10))
+    elif access == "carriageways":
+        nodes[11] = (250.0, 110.0)
+        ways += [street("Access", 6, 10, oneway="yes"), street("Access", 11, 6, oneway="yes")]
     osm = write_map(tmp_path / "map.osm", nodes, ways, {1: {"highway": "traffic_signals"}})
     summary = create_scenario(tmp_path / "out", osm, None)
     assert len(summary.flows) == 12

@@ -76,7 +76,7 @@ def test_solids_beyond_sensor_range_are_left_out_with_a_note(tmp_path: Path) -> 
     assert summary.statics.counts.dropped["out_of_range"] == {"building": 1, "tree": 1}
     assert summary.statics.counts.objects == plain.statics.counts.objects
     total = 2 + plain.statics.counts.objects.total() - plain.statics.counts.objects["tree_crown"]
-    assert f"2 of {total} static objects are left out: they are beyond the range of a VLP-32C (200 m) from" in str(
+    assert f"2 of {total} static objects are left out: more than 200 m (the range of a VLP-32C) from" in str(
         summary.notes
     )
     assert "left out" not in str(plain.notes)

@@ -177,8 +177,10 @@ def test_heights_from_surface_model_count_as_known_for_neighbours() -> None:
     assert [(solid.height_m, solid.height_source) for solid in objects.solids] == [
         (12.0, "surface model"), (12.0, "surface model"), (12.0, "surface model"), (12.0, "neighbours"),
     ]  # fmt: skip
-    notes = scenario_notes(True, objects.counts)
-    assert any("3 of 4 buildings" in note and "surface model above the terrain" in note for note in notes)
+    assert scenario_notes(True, objects.counts) == [
+        "4 of 4 buildings have neither height nor levels: the median height of the buildings near by assumed for 1,"
+        " the surface model above the terrain used for 3."
+    ]
 
 
 class Plane:
@@ -260,8 +262,8 @@ def test_alignment_turns_and_moves() -> None:
     ("pairs", "problem"),
     [
         ([((0, 0), (1, 1))], "expected two points"),
-        ([((0, 0), (0, 0)), ((10, 0), (11, 0))], "10.00 m apart in the file and 11.00 m on the ground"),
-        ([((0, 0), (0, 0)), ((0, 0), (0, 0))], "0.00 m apart"),
+        ([((0, 0), (0, 0)), ((10, 0), (11, 0))], "10.00 apart in the file and 11.00 m on the ground"),
+        ([((0, 0), (0, 0)), ((0, 0), (0, 0))], "0.00 apart"),
     ],
 )
 def test_rejects_alignment(pairs: list[alignment.PointPair], problem: str) -> None:
@@ -340,7 +342,7 @@ def test_network_that_sumo_rejects_is_named(tmp_path: Path, run_egvs) -> None:
     assert count
     network.write_text(text, encoding="utf-8")
     code, _, error = run_egvs("new", tmp_path / "made", "--from", network)
-    assert code == 2 and f"{network}: SUMO cannot simulate the network (" in error and "none_such" in error
+    assert code == 2 and f"{network}: SUMO cannot simulate the network: " in error and "none_such" in error
     assert not (tmp_path / "made").exists()
 
 

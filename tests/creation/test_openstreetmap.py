@@ -547,7 +547,8 @@ def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch
     traffic = create_scenario(tmp_path / "out", SMALL).traffic
     assert isinstance(traffic, AssumedTraffic)
     assert traffic.carried_per_h == 10 * round(0.0644 * traffic.assumed_per_h)
-    assert traffic.summary == f"carries {traffic.carried_per_h:,} vehicles an hour; medium 75 % is used"
+    carried = f"{traffic.carried_per_h:,} of {traffic.assumed_per_h:,}"
+    assert traffic.summary == f"carries {carried} vehicles an hour; medium 75 % is used"
     assert traffic.per_h == pytest.approx(0.75 * traffic.carried_per_h, abs=12)
     monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: Capacity(0.155, runs[:1]))
     notes = create_scenario(tmp_path / "jammed", SMALL).notes

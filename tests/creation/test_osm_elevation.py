@@ -41,6 +41,13 @@ def test_few_heights_are_ignored_and_counted(tmp_path: Path) -> None:
     assert not found.heights_m and found.known == 8
 
 
+def test_single_heights_have_no_note(tmp_path: Path) -> None:
+    nodes = {number: (10.0 * number, 0.0) for number in range(1, 201)}
+    path = write_map(tmp_path / "map.osm", nodes, [street("Main", *nodes)], {7: {"ele": "200"}})
+    found = read_elevations(read_osm(path))
+    assert (found.known, found.total, found.note, dict(found.heights_m)) == (1, 200, "", {})
+
+
 def test_missing_heights_lie_between_their_neighbours(tmp_path: Path) -> None:
     some = {node: grade_m(node) for node in NODES if node not in (3, 11)}
     found = read_elevations(extract(tmp_path, {**some, 2: f"{grade_m(2)} m"}))

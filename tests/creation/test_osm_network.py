@@ -51,6 +51,19 @@ def test_streets_end_on_the_circle() -> None:
     assert lines_m(cut) == {7: [(-100, 0), (0, 0), (80, 0)], 8: [(0, -90), (0, 0), (0, 100)]}
 
 
+@pytest.mark.system
+def test_streets_without_tags_have_notes_and_a_name(tmp_path: Path) -> None:
+    """Two main roads cross; netconvert assumes two lanes each way and 100 km/h where their tags say nothing."""
+    ways: dict[int, list[tuple[float, float]]] = {7: [(-100, 0), (0, 0), (100, 0)], 8: [(0, -100), (0, 0), (0, 100)]}
+    tags = {7: {"highway": "primary", "ref": "B 62", "lanes": "2", "maxspeed": "50"}, 8: {"highway": "primary"}}
+    network = street_network.build_network(extract(ways, tags), tmp_path / "map.osm", street_network.NETCONVERT_FLAGS)
+    assert {edge.name for edge in network.streets.network.edges} == {"B 62", ""}
+    assert network.notes == (
+        "Numbers of lanes that the map does not state are assumed by road class: 2 for 4 edges.",
+        "Speed limits that the map does not state are assumed by road class: 100 km/h for 4 edges.",
+    )
+
+
 def test_longer_piece_of_street_keeps_its_id() -> None:
     way = [(-50, 0), (0, 0), (60, 0), (300, 0), (300, 80), (0, 80), (0, 70)]
     joining = [(0, 0), (0, 70)]

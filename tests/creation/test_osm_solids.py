@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from shapely.geometry import Point
 
 from egvs.creation.map_parts import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap import solids as osm_solids
@@ -107,6 +108,8 @@ def test_counts_building_without_outline() -> None:
     extract = OsmExtract({node: (0.0, 0.0) for node in XY}, points, {}, (), Bounds(0, 0, 1, 1), False)
     assert not list(find_buildings(extract, XY, counts))
     assert counts.dropped == {"no_outline": {"building": 2}}
+    assert not list(find_buildings(extract, XY, counts, Point(900, 900)))
+    assert counts.dropped == {"no_outline": {"building": 2}}, "out of reach"
 
 
 def test_object_on_wall_starts_above_it() -> None:

@@ -78,8 +78,8 @@ def edge_turns(made: StreetNetwork) -> set[tuple[str, str]]:
 
 
 def notes(made: StreetNetwork) -> tuple[str, ...]:
-    """The notes, without the one on U-turns."""
-    return tuple(note for note in made.notes if "U-turn" not in note)
+    """The notes on turns, without the one on U-turns."""
+    return tuple(note for note in made.notes if "U-turn" not in note and "assumed by road class" not in note)
 
 
 def divided_road() -> tuple[MapDraft, dict[str, int]]:
@@ -172,6 +172,42 @@ def test_restrictions_that_a_network_cannot_keep_are_named(tags: dict[str, str],
     made = build(draft.extract())
     assert ((str(ways["north"]), str(ways["to east"])) in edge_turns(made)) == is_open
     assert notes(made)[-1] == f"Turn restrictions that hold {expected}: 1 (relation {relation})."
+
+
+@pytest.mark.parametrize("via", [None, (0.0, ARM_M)])
+def test_restriction_whose_streets_do_not_meet_at_its_node_is_named(via: XY | None) -> None:
+    draft, ways = divided_road()
+    members = [] if via is None else draft.via(via)
+    relation = draft.restrict("no_left_turn", ways["middle"], members, ways["to east"])
+    (note,) = notes(build(draft.extract()))
+    assert note.startswith("Turn restrictions whose streets do not meet at their via, and which are left out")
+    assert note.endswith(f"1 (relation {relation}).")
+
+
+def test_restriction_without_a_target_is_named() -> None:
+    draft, ways = divided_road()
+    relation = draft.restrict("no_left_turn", ways["middle"], draft.via((0.0, -APART_M)), ways["to east"])
+    draft.relations = [replace(draft.relations[0], members=draft.relations[0].members[:-1])]
+    (note,) = notes(build(draft.extract()))
+    assert note.startswith("Turn restrictions whose streets do not meet") and f"(relation {relation})" in note
+
+
+def test_only_permitted_way_may_be_no_street() -> None:
+    """All turns would be closed; the footway is drawn to the middle of the junction."""
+    draft, ways = divided_road()
+    path = draft.way((0.0, -APART_M), (30.0, -40.0), highway="footway")
+    relation = draft.restrict("only_left_turn", ways["from west"], draft.via((0.0, -APART_M)), path)
+    made = build(draft.extract())
+    assert any("whose only permitted street is not in the network" in n and str(relation) in n for n in notes(made))
+    assert (str(ways["from west"]), str(ways["to east"])) in edge_turns(made)
+
+
+def test_turn_that_is_forbidden_at_red_is_open() -> None:
+    """netconvert would close it."""
+    draft, ways = divided_road()
+    draft.restrict("no_right_turn_on_red", ways["from west"], draft.via((0.0, -APART_M)), ways["south"])
+    made = build(draft.extract())
+    assert (str(ways["from west"]), str(ways["south"])) in edge_turns(made)
 
 
 def test_restriction_over_street_between_junctions_is_named() -> None:
@@ -373,6 +409,9 @@ def test_many_random_junctions_have_the_turns_of_the_map() -> None:
     assert sum(check_random_map(seed) for seed in range(6, 120)) > 20
 
 
+KIND = '<tag k="type" v="restriction"/>'
+
+
 def test_restrictions_are_read_as_the_map_states_them(tmp_path: Path) -> None:
     """A file with a restriction in each of the forms of the wiki."""
     path = tmp_path / "map.osm"
@@ -385,15 +424,17 @@ def test_restrictions_are_read_as_the_map_states_them(tmp_path: Path) -> None:
         '<tag k="restriction" v="no_left_turn"/><tag k="hour_on" v="07:00"/><tag k="hour_off" v="09:00"/>',
         '<tag k="restriction:conditional" v="no_left_turn @ (Sa)"/>',
         '<tag k="restriction" v="loading_only"/>',
+        '<tag k="type" v="restriction:motorcar"/><tag k="restriction" v="no_left_turn"/>',
+        '<tag k="type" v="restriction:bus"/><tag k="restriction" v="no_left_turn"/>',
     ]
     relations = "".join(
         f'<relation id="{number}">{members}<member type="way" ref="2" role="to"/>'
-        f'<tag k="type" v="restriction"/>{form}</relation>'
+        f"{form if 'type' in form else KIND + form}</relation>"
         for number, form in enumerate(forms, 1)
     )
     nodes = "".join(f'<node id="{number}" lat="52" lon="{10 + number / 1000}"/>' for number in (1, 2, 3))
     ways = '<way id="1"><nd ref="1"/><nd ref="2"/></way><way id="2"><nd ref="2"/><nd ref="3"/></way>'
     path.write_text(f'<osm version="0.6">{nodes}{ways}{relations}</osm>')
     found = read_restrictions(osm.read_osm(path))
-    assert [restriction.id for restriction in found.in_force] == [1, 3]
-    assert (found.by_vehicle, found.conditional, found.with_exceptions) == ((2, 4), (5, 6), ())
+    assert [restriction.id for restriction in found.in_force] == [1, 3, 8]
+    assert (found.by_vehicle, found.conditional, found.with_exceptions) == ((2, 4, 9), (5, 6), ())

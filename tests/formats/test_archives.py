@@ -50,6 +50,37 @@ def test_an_archive_is_a_folder_of_its_files(tmp_path: Path) -> None:
     assert not folder.exists()
 
 
+def test_archives_in_archives_are_folders(tmp_path: Path) -> None:
+    def packed(members: Mapping[str, str | bytes]) -> bytes:
+        return write_zip(tmp_path / "made", members).read_bytes()
+
+    two = packed({"deep.zip": packed({"b.txt": "two"}), "named.zip": "text"})
+    path = write_zip(tmp_path / "a.zip", {"x/tiles.zip": two, "a.txt": "one"})
+    with unpack_archives([path]) as unpacked:
+        (folder,) = unpacked.paths
+        texts = {file.relative_to(folder).as_posix(): file.read_text() for file in folder.rglob("*") if file.is_file()}
+    assert texts == {"a.txt": "one", "x/tiles.zip/deep.zip/b.txt": "two", "x/tiles.zip/named.zip": "text"}
+    out = packed({"../out.txt": "x"})
+    for members, message in (
+        (
+            {"x.zip": packed({"y.zip": packed({"z.zip": packed({"b": ""})})})},
+            r"a\.zip/x\.zip/y\.zip/z\.zip: .* more than 3 deep",
+        ),
+        ({"x.zip": out}, r"a\.zip/x\.zip: its member '\.\./out\.txt' leads out of the archive"),
+    ):
+        with pytest.raises(InputError, match=message), unpack_archives([write_zip(path, members)]):
+            pass
+
+
+def test_first_bytes_tell_an_archive(tmp_path: Path) -> None:
+    named = tmp_path / "map.zip"
+    named.write_text("<osm/>")
+    zipped = write_zip(tmp_path / "map.osm", {"map.osm": "<osm/>"})
+    with unpack_archives([named, zipped]) as unpacked:
+        assert unpacked.paths[0] == named
+        assert (unpacked.paths[1] / "map.osm").read_text() == "<osm/>"
+
+
 def test_errors_name_the_archive(tmp_path: Path) -> None:
     path = write_zip(tmp_path / "tiles.zip", {"a.txt": "one"})
     with (
@@ -100,7 +131,6 @@ def test_damaged_and_encrypted_archives(tmp_path: Path) -> None:
     encrypted = good[: directory + 8] + b"\1" + good[directory + 9 :]
     damaged = good[:40] + bytes(8) + good[48:]
     for content, message in (
-        (b"no archive", "cannot be read as a ZIP archive"),
         (good[:-30], "cannot be read as a ZIP archive"),
         (encrypted, r"its member 'a\.txt' is encrypted"),
         (damaged, r"a\.zip: .*"),

@@ -363,6 +363,23 @@ def test_one_message_where_proj_cannot_convert(crs: str, message: str) -> None:
         parse_crs(crs, "a.csv: crs")
 
 
+def test_grid_that_the_datum_makes_needless_is_left_out() -> None:
+    """SUMO would reject the string."""
+    needless = "+proj=utm +zone=32 +datum=WGS84 +nadgrids=none_such.gsb +units=m"
+    assert proj_string(needless, "a") == "+proj=utm +zone=32 +datum=WGS84 +units=m"
+    mercator = "+proj=merc +a=6378137 +b=6378137 +units=m +nadgrids=@null"
+    assert proj_string(mercator, "a") == mercator
+
+
+def test_old_form_of_an_epsg_code_is_read_without_a_warning() -> None:
+    assert parse_crs("+init=epsg:25832", "a").to_epsg() == 25832
+
+
+def test_message_about_another_planet_is_complete() -> None:
+    with pytest.raises(InputError, match=r"\(Source and target .* celestial body \(Earth vs Moon\)\)\. Use"):
+        parse_crs("+proj=longlat +a=1737400 +b=1737400", "a")
+
+
 def test_a_local_system_in_feet_is_converted_to_metres() -> None:
     local = CRS('LOCAL_CS["site",UNIT["foot",0.3048],AXIS["E",EAST],AXIS["N",NORTH]]').to_wkt()
     roi = Roi((0.0, 0.0, 0.0), (10.0, 10.0, 5.0))

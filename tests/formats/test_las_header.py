@@ -17,7 +17,7 @@ from pyproj import CRS, Transformer
 from egvs.core.errors import InputError
 from egvs.formats.georeference import height_unit, parse_crs
 from egvs.formats.geotiff_keys import GeoKeys
-from egvs.formats.point_clouds import point_cloud_crs, read_points, stream_points
+from egvs.formats.point_clouds import other_point_cloud_crs, point_cloud_crs, read_points, stream_points
 
 laspy = pytest.importorskip("laspy")
 
@@ -97,6 +97,7 @@ def position(crs: str, lon_lat_deg: tuple[float, float]) -> list[float]:
         ({1024: 1, 2048: 32767, 2050: 6269, 3072: 32767, 3075: 11, 3078: 29.5, 3079: 45.5, 3080: -96.0, 3081: 23.0},
          "+proj=aea +lat_0=23 +lon_0=-96 +lat_1=29.5 +lat_2=45.5 +datum=NAD83", (-93.35, 35.0)),
         ({1024: 2, 2048: 4326}, "OGC:CRS84", (8.0, 50.0)),
+        ({1024: 1, 3072: 7415}, "EPSG:28992", (5.4, 52.2)),
         ({1024: 2, 2048: 32767, 2057: 6378137.0, 2059: 298.257222101, 2054: 9102}, "OGC:CRS84", (8.0, 50.0)),
     ],
 )  # fmt: skip
@@ -117,6 +118,8 @@ def test_keys_place_points_as_the_same_system_of_proj(
         (UTM_15 | {4096: 5103}, 1.0, "NAVD88 height"),
         (UTM_15 | {4099: 9002}, 0.3048, "heights of the GeoTIFF keys"),
         (UTM_15 | {4096: 32767, 4097: "Town datum", 4099: 9002}, 0.3048, "Town datum"),
+        (UTM_15 | {4096: 4979}, 1.0, "heights of the GeoTIFF keys"),
+        ({1024: 1, 3072: 7415}, 1.0, "NAP height"),
         (UTM_15 | {4096: 5030, 4099: 9001}, 1.0, "heights of the GeoTIFF keys"),
         ({1024: 1, 3072: 2255}, SURVEY_FOOT_M, "the unit of x and y: the file declares no vertical system"),
         ({1024: 1, 3072: 2255, 4096: 5703, 4099: 9001}, 1.0, "NAVD88 height"),
@@ -135,7 +138,8 @@ def test_unit_of_heights_and_what_states_it(keys: dict[int, Any], metres: float,
 
 def test_unknown_keys_name_no_system() -> None:
     assert GeoKeys.from_records({}).to_crs() is None
-    assert GeoKeys.from_records(key_records({1024: 1, 2048: 32767, 3072: 32767})).to_crs() is None
+    for keys in ({1024: 1, 2048: 32767, 3072: 32767}, {1024: 1, 2048: 4269}):  # a projection without its parameters
+        assert GeoKeys.from_records(key_records(keys)).to_crs() is None
 
 
 @pytest.mark.parametrize(
@@ -144,6 +148,7 @@ def test_unknown_keys_name_no_system() -> None:
         (key_records({1024: 1, 3072: 5}), "name EPSG:5, which PROJ does not know"),
         (key_records({1024: 1, 2048: 4326, 3072: 32767, 3075: 4}), "the projection method 4 .* is unknown"),
         (key_records({1024: 1, 3072: 32767, 3075: 1}), "neither a datum nor an ellipsoid"),
+        (key_records(UTM_15 | {4096: 4326}), "name EPSG:4326 as a VerticalCRS, but it has no heights"),
         (key_records(UTM_15 | {3076: 77}), "the unit 77 .* is unknown"),
         ({34735: struct.pack("<4H", 1, 1, 0, 900)}, "declares 900 keys in 8 bytes"),
         ({34735: struct.pack("<8H", 1, 1, 0, 1, 3080, 34736, 1, 4)}, "key 3080 points beyond its record"),
@@ -169,6 +174,15 @@ def test_flag_of_the_header_says_which_record_counts(tmp_path: Path) -> None:
     assert height_unit(by_keys, "").metres == 1.0
     empty = point_cloud_crs(write_las(tmp_path / "c.las", keys=UTM_15, wkt='""', wkt_flag=True), "")
     assert empty == by_keys
+
+
+def test_other_record_of_a_reference_system(tmp_path: Path) -> None:
+    both: dict[str, Any] = {"keys": UTM_15, "wkt": WKT_UTM_FEET}
+    other = other_point_cloud_crs(write_las(tmp_path / "a.las", **both, wkt_flag=True), "")
+    assert other is not None and height_unit(other, "").metres == 1.0
+    assert other_point_cloud_crs(write_las(tmp_path / "b.las", **both), "") == WKT_UTM_FEET
+    assert other_point_cloud_crs(write_las(tmp_path / "c.las", keys=UTM_15), "") is None
+    assert other_point_cloud_crs(write_las(tmp_path / "d.las", keys=UTM_15, wkt="Local"), "") is None
 
 
 def test_texts_that_are_no_reference_system(tmp_path: Path) -> None:

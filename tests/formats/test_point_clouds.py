@@ -172,6 +172,19 @@ def test_padding_behind_binary_points(tmp_path: Path, padding: bytes) -> None:
         assert read(tmp_path, name, content + padding) == POINTS.tolist()
 
 
+def test_pcd_compressed_has_no_block_for_padding_between_the_fields(tmp_path: Path) -> None:
+    points = np.arange(21.0).reshape(7, 3)
+    head = pcd("x y z _", "4 4 4 1", "F F F U", 7, "binary_compressed", "COUNT 1 1 1 20\n")
+    blocks = points.astype("<f4").T.tobytes()
+    for padding in (b"", bytes(140)):
+        assert read(tmp_path, "a.pcd", head + packed(blocks + padding)) == points.tolist()
+
+
+def test_pcd_ascii_with_old_keyword_and_padding(tmp_path: Path) -> None:
+    head = pcd("x y z", "4 4 4", "F F F", 1, "ascii").decode().replace("FIELDS", "COLUMNS")
+    assert read(tmp_path, "a.pcd", head + "1 2 3\n\0\0\0\0") == [[1, 2, 3]]
+
+
 def test_pcd_ascii_reads_fields_in_any_order(tmp_path: Path) -> None:
     head = pcd("rgb z y n x", "4 4 4 4 8", "U F F F F", 2, "ascii", "COUNT 1 1 1 2 1\n").decode()
     assert read(tmp_path, "a.pcd", head + "9 3 2 0 0 1\r\n\n9\t6 5  nan inf 4.1") == [[1, 2, 3], [4.1, 5, 6]]

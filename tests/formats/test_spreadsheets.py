@@ -11,8 +11,9 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan
+from egvs.formats import workbooks
 from egvs.formats.spreadsheets import parse_rows, read_rows
-from tests.formats.workbooks import write_ods, write_xlsx
+from tests.formats.workbooks import encrypted_workbook, write_ods, write_xlsx
 
 Row = tuple[str, dict[str, str]]
 
@@ -87,6 +88,14 @@ def test_commas_in_other_texts_stay(tmp_path: Path) -> None:
         (b'a,b\n"1"x,2\n', r"t.csv: line 2: is not CSV"),
         (b"a|b\n1|2\n", r"t.csv: the columns are separated by '\|'. Use commas or semicolons"),
         (b"a;b\n1;2,500\n", r"t.csv: line 2: b: 2,500 can mean 2500 or 2.500"),
+        (b"a;b\n1;2,5\n1;1.500\n", r"t.csv: line 3: b: 1.500 can mean 1500 or 1.500"),
+        (
+            b"Sites of the town,,\n,,\na,b\n1,2\n",
+            r"t.csv: line 1: .* got 'Sites of the town' alone. Remove",
+        ),
+        (b"# by hand\na,b\n1,2\n", r"t.csv: line 1: expected the names of the columns, got '# by hand' alone"),
+        (b"<html><table><tr><td>a</td></tr></table></html>", r"t.csv: expected a table, got HTML or XML"),
+        (b'<?xml version="1.0"?><Workbook/>', r"t.csv: expected a table, got HTML or XML"),
         (b"", r"t.csv: expected a header and rows, got no values"),
         (b"a,b\n\x81,2\n", r"t.csv: is no text in a known encoding \(byte 4\)"),
         (b"a,b\n1\0,2\n", r"t.csv: is no text: it has the control character"),
@@ -182,6 +191,81 @@ def test_damaged_workbook(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"t\.xlsx: cannot be read as a workbook"):
         read(path)
+
+
+@pytest.mark.system
+def test_errors_of_formulas_are_not_empty_cells(tmp_path: Path) -> None:
+    path = tmp_path / "t.xlsx"
+    write_xlsx(path, {"Other": (("x", "#REF!"),), "Sites": (("a", "b"), ("k", "#DIV/0!"))}, hidden=("Other",))
+    assert read(path) == [(f"{path}: row 2", {"a": "k", "b": "#DIV/0!"})]
+
+
+@pytest.mark.system
+def test_archive_of_other_files_is_no_damaged_workbook(tmp_path: Path) -> None:
+    path = tmp_path / "t.xlsx"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("sites.csv", "a,b\n1,2\n")
+    with pytest.raises(InputError, match=r"t\.xlsx: expected a workbook, got a ZIP archive of other files. Unpack it"):
+        read(path)
+
+
+@pytest.mark.system
+def test_workbook_with_a_password_is_no_damaged_file(tmp_path: Path) -> None:
+    path = tmp_path / "t.xlsx"
+    path.write_bytes(encrypted_workbook())
+    with pytest.raises(InputError, match=r"t\.xlsx: the workbook is protected by a password"):
+        read(path)
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("</sheetData>", "</sheetData><mergeCells><mergeCell ref='B2:B3'/></mergeCells>",
+         "sheet 'a': the cells of rows 2 to 3 and columns 2 to 2 are merged. Unmerge them"),
+        ("<row r='3'", "<row r='3' hidden='1'", "sheet 'a': rows with values are hidden: 3. Show or delete them."),
+    ],
+)  # fmt: skip
+def test_rejects_cells_that_a_reader_cannot_see(tmp_path: Path, before: str, after: str, message: str) -> None:
+    path = _edited_workbook(tmp_path, before, after)
+    with pytest.raises(InputError) as caught:
+        read(path)
+    assert message in str(caught.value)
+
+
+@pytest.mark.system
+def test_formula_without_a_value_is_no_empty_cell(tmp_path: Path) -> None:
+    """Programs that write workbooks do not compute."""
+    path = _edited_workbook(tmp_path, "<c r='B2'><v>2</v></c>", "<c r='B2'><f>1+1</f></c>")
+    assert read(path)[0][1] == {"a": "1", "b": "a formula without a value"}
+    path = _edited_workbook(tmp_path, "<c r='B2'><v>2</v></c>", "<c r='B2'><f>1+1</f><v>2</v></c>")
+    assert read(path)[0][1] == {"a": "1", "b": "2"}
+
+
+def _edited_workbook(folder: Path, before: str, after: str) -> Path:
+    plain, path = folder / "plain.xlsx", folder / "t.xlsx"
+    write_xlsx(plain, {"a": (("a", "b"), (1, 2), (3, 4))})
+    with zipfile.ZipFile(plain) as old, zipfile.ZipFile(path, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name).decode().replace(before, after))
+    return path
+
+
+@pytest.mark.system
+def test_number_of_rows_has_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A million rows in a few kilobytes; lines without values do not count, and need no memory."""
+    path = tmp_path / "t.xlsx"
+    write_xlsx(path, {"a": (("a", "b"), (1, 2), ("x",))})
+    far = tmp_path / "far.xlsx"
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(far, "w") as new:
+        for name in old.namelist():
+            new.writestr(name, old.read(name).replace(b"'A3'", b"'A600000'").replace(b"row r='3'", b"row r='600000'"))
+    with pytest.raises(InputError, match=r"far\.xlsx: sheet 'a': has more than 500,000 rows"):
+        read(far)
+    monkeypatch.setattr(workbooks, "MAX_ROWS", 2)
+    assert len(read_bytes(tmp_path, b"a,b\n" + b"\n" * 1000 + b"1,2\n")) == 1
+    with pytest.raises(InputError, match="has more than 2 rows"):
+        read_bytes(tmp_path, b"a,b\n1,2\n3,4\n")
 
 
 @pytest.mark.system

@@ -16,7 +16,7 @@ import shapely
 
 import egvs
 from egvs.core import plugins
-from egvs.core.errors import DiagnosticsError, InputError, MissingExtraError
+from egvs.core.errors import InputError, MissingExtraError
 from egvs.core.grid import Roi
 from egvs.formats import vector_files
 from egvs.formats.georeference import Georeference, WorldFrame
@@ -124,14 +124,14 @@ def test_kml_altitudes_count_only_above_the_ground(located: Path) -> None:
         candidates(located, "poles.kml")
 
     write_kml(located / "poles.kml", mode="clampToGround")
-    with pytest.raises(DiagnosticsError, match="z_m is missing"):
+    with pytest.raises(InputError, match="z_m is missing"):
         candidates(located, "poles.kml")
 
 
 @pytest.mark.parametrize("suffix", ["gpkg", "parquet"])
 def test_columns_of_other_programs_are_rejected_with_the_hint(located: Path, suffix: str) -> None:
     write(located / f"poles.{suffix}", frame_of({"site": ["a", "b"], "z_m": [3.0, 3.0], "heading": [0.0, 90.0]}))
-    with pytest.raises(DiagnosticsError, match=r"the column 'heading' has no effect\. Use yaw_deg, counter-clockwise"):
+    with pytest.raises(InputError, match=r"the column 'heading' has no effect\. Use yaw_deg, counter-clockwise"):
         candidates(located, f"poles.{suffix}")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import struct
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ _STYLES = f'<styleSheet xmlns="{_MAIN}"><cellXfs><xf numFmtId="0"/><xf numFmtId=
 
 
 def write_xlsx(path: Path, sheets: Mapping[str, Rows], hidden: Sequence[str] = ()) -> None:
-    """Write the sheets of a workbook; times of the day have the format h:mm."""
+    """Write the sheets of a workbook; times of the day have the format h:mm, and texts with a # are errors."""
     names = list(sheets)
     entries = "".join(
         f"<sheet name={quoteattr(name)} state='{'hidden' if name in hidden else 'visible'}' sheetId='{n}' r:id='s{n}'/>"
@@ -55,6 +56,8 @@ def _xlsx_cell(value: Cell, row: int, column: int) -> str:
             return ""
         case bool():
             return f"<c {where} t='b'><v>{int(value)}</v></c>"
+        case str() if value.startswith("#"):
+            return f"<c {where} t='e'><v>{value}</v></c>"
         case str():
             return f"<c {where} t='inlineStr'><is><t>{escape(value)}</t></is></c>"
         case datetime.time():
@@ -80,3 +83,19 @@ def _ods_cell(value: Cell) -> str:
         text = f"<text:p>{escape(value)}</text:p>"
         return f"<table:table-cell office:value-type='string'>{text}</table:table-cell>"
     return f"<table:table-cell office:value-type='float' office:value='{value!r}'/>"
+
+
+def encrypted_workbook() -> bytes:
+    """The OLE file of a workbook with a password: a folder with the stream EncryptedPackage, which has no meaning."""
+    free, end, table = 0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD
+    head = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1".ljust(24, b"\0") + struct.pack("<5H6x", 62, 3, 0xFFFE, 9, 6)
+    head += struct.pack("<9I", 0, 1, 1, 0, 4096, end, 0, end, 0) + struct.pack("<109I", 0, *[free] * 108)
+    sectors = struct.pack("<128I", table, end, *range(3, 10), end, *[free] * 118)
+    folder = _ole_entry("Root Entry", 5, 1, end, 0) + _ole_entry("EncryptedPackage", 2, free, 2, 4096)
+    return head + sectors + folder.ljust(512, b"\0") + b"x" * 4096
+
+
+def _ole_entry(name: str, kind: int, child: int, start: int, size: int) -> bytes:
+    text = f"{name}\0".encode("utf-16-le")
+    links = struct.pack("<HBB3I36x", len(text), kind, 1, 0xFFFFFFFF, 0xFFFFFFFF, child)
+    return text.ljust(64, b"\0") + links + struct.pack("<IQ", start, size)

@@ -278,7 +278,13 @@ DUPLICATES = (
         "fcd.xml",
         "not with a decimal comma",
     ),
-    Case("decimal comma in a site", street, text("sites.csv", "12.2", '"12,2"'), "row pole_a: y_m", "decimal comma"),
+    Case(
+        "underscore in a number of a site",
+        street,
+        text("sites.csv", "12.2", "1_2"),
+        "line 2 (pole_a): y_m",
+        "expected a finite",
+    ),
     Case("decimal comma in the scenario", street, key("roi.voxel_m", "0,5"), "roi.voxel_m", "decimal comma"),
     Case(
         "decimal commas of tracks",

@@ -178,7 +178,7 @@ UNITS = (
         "pitch beyond the vertical",
         street,
         mounts(lambda mount: replace(mount, pitch_deg=95.0)),
-        "sites.csv: row pole_a: pitch_deg",
+        "sites.csv: line 2 (pole_a): pitch_deg",
         "expected an angle between -90 and 90, got 95",
     ),
     Case(

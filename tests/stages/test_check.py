@@ -13,7 +13,7 @@ import egvs
 from egvs.core.errors import DiagnosticsError, InputError
 from egvs.report.sections import describe_poles_on_road
 from egvs.sensors.sites import Pose, Site
-from egvs.stages import check, scene_checks
+from egvs.stages import check, scene_checks, traffic_checks
 from egvs.stages.inputs import CheckInputs, Inputs
 from egvs.traffic import network, sumo, sumo_folder
 from egvs.world.carriageway import Carriageway
@@ -603,6 +603,15 @@ def test_map_is_converted_once(street: Path, monkeypatch: pytest.MonkeyPatch) ->
     (street / "map.osm").write_text("<osm> </osm>")
     sumo_folder.read_network(scenario)
     assert calls == ["netconvert", "netconvert"]
+
+
+def test_map_as_network_gets_a_warning_that_names_egvs_new(street: Path) -> None:
+    (street / "map.osm").write_text("<osm/>")
+    scenario = egvs.load(street, ['traffic.network="map.osm"'])
+    (finding,) = traffic_checks.warn_map_as_network(CheckInputs(scenario, complete=None))
+    assert not finding.is_error
+    assert "Make the network with egvs new NAME --from map.osm" in str(finding)
+    assert not list(traffic_checks.warn_map_as_network(CheckInputs(egvs.load(street))))
 
 
 # ---- the scene alone

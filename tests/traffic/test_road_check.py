@@ -209,6 +209,30 @@ def test_pedestrians_and_bicycles_do_not_count(roads: Network) -> None:
     assert (check.positions, check.headings) == (0, 0)
 
 
+@pytest.mark.parametrize(("step_s", "cut", "expected"), [(0.2, True, True), (0.2, False, False), (1.0, False, False)])
+def test_vehicles_that_jump_over_a_junction(roads: Network, step_s: float, cut: bool, expected: bool) -> None:
+    """A file from a network without internal links has no rows between the stop lines, 6 m from the middle."""
+    steps = np.arange(0.0, 100.0, 12.0 * step_s)
+    rows = []
+    for vehicle in range(24):
+        x_m, y_m, angle_deg = list(DRIVES.values())[vehicle % 4]
+        along = np.deg2rad(90.0 - angle_deg)
+        x, y = x_m + (steps + vehicle / 10) * np.cos(along), y_m + (steps + vehicle / 10) * np.sin(along)
+        is_outside = np.maximum(np.abs(x), np.abs(y)) > 6.0 if cut else np.ones(len(x), dtype=bool)
+        x, y = x[is_outside], y[is_outside]
+        time_ms = 1000 * step_s * np.arange(len(x))
+        rows.append(np.column_stack([time_ms, np.full(len(x), vehicle), x, y, np.full(len(x), angle_deg)]))
+    table = dict(zip(("time_ms", "vehicle", "x", "y", "angle"), np.concatenate(rows).T, strict=True))
+    found = findings(table, roads)
+    assert ("jumps over junctions" in found) == expected
+    assert "jumps" not in found
+    if expected:
+        assert not found["jumps over junctions"].is_error
+        assert "are inside them in 0 rows: the network that SUMO used had no internal links" in str(
+            found["jumps over junctions"]
+        )
+
+
 def test_junction_without_lanes_is_road(tmp_path: Path) -> None:
     """In a network without lanes inside junctions, vehicles cross them in any direction."""
     edges = edge("we", "-60,-1.6 -20,-1.6") + edge("out", "20,-1.6 60,-1.6") + edge("up", "1.6,20 1.6,60")

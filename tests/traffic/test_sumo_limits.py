@@ -42,7 +42,7 @@ def test_sumo_that_writes_is_not_idle(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_sumo_has_a_limit_of_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_sumo(tmp_path, monkeypatch, "while :; do :; done")
     monkeypatch.setenv(limits.SUMO_TIME.name, "1")
-    message = r"^sumo worked for more than 3 s\. The limit is 1 s; set EGVS_MAX_SUMO_S to raise it$"
+    message = r"^sumo worked for more than 3 s\. The limit is 1 s; set EGVS_MAX_SUMO_S to raise it\.$"
     with pytest.raises(sumo.SumoInputError, match=message):
         sumo.run_program("sumo", [], tmp_path, time_steps=2)
 
@@ -55,7 +55,7 @@ def test_sumo_has_a_limit_of_memory(town: Path, tmp_path: Path, monkeypatch: pyt
     flow = f'<flow id="f" begin="0" end="60" number="1000000000"><route edges="{edge}"/></flow>'
     (tmp_path / "r.rou.xml").write_text(f"<routes>{flow}</routes>")
     monkeypatch.setenv(limits.SUMO_MEMORY.name, "300")
-    message = r"^sumo needed more than 300 MB of memory\. The limit is 300 MB; set EGVS_MAX_SUMO_MB to raise it$"
+    message = r"^sumo needed more than 300 MB of memory\. The limit is 300 MB; set EGVS_MAX_SUMO_MB to raise it\.$"
     with pytest.raises(sumo.SumoInputError, match=message):
         sumo.run_program("sumo", ["-n", "net.xml", "-r", "r.rou.xml", "--end", "10"], tmp_path)
 

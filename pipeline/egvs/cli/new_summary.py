@@ -52,7 +52,10 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     yield "traffic", scenario.traffic.describe()
     mounts = f"{len(junctions.HEIGHTS_M)} heights x {len(PITCHES_DEG)} tilts"
     yield "sites", f"{scenario.n_candidates:,} candidates: {scenario.poles} poles x {mounts}, sensor {SENSOR}"
-    yield "solids", describe_solids(statics.counts, statics.n_solids)
+    solids = describe_solids(statics.counts, statics.n_solids)
+    if statics.n_solids <= 1:  # the ground
+        solids += ": nothing hides vehicles"
+    yield "solids", solids
     if left_out := describe_dropped(statics.counts):
         yield "", f"left out: {left_out} (all counts: {STATICS_FILE})"
     for summary in statics.maps if len(statics.maps) > 1 or statics.maps_have_notes else ():
@@ -81,7 +84,7 @@ def _position(scenario: NewScenario) -> str:
 
 
 def describe_streets(streets: Streets) -> str:
-    signalised = sum(junction.signalised for junction in streets.junctions)
+    signalised = sum(junction.signalised for junction in junctions.distinct_crossings(streets))
     length = f"{streets.lane_length_m / 1000:,.1f} km of lanes"
     return (
         f"{number_of(len(streets.network.edges), 'edge')}, {length}, {number_of(signalised, 'junction')} with signals"

@@ -20,9 +20,11 @@ _SYSTEM_FILES = ("/usr", "/lib", "/lib64", "/etc/ld.so.cache", "/etc/localtime",
 
 
 OUT_OF_MEMORY = re.compile(
-    r"bad_alloc|MemoryError|more memory|out ?of ?memory|cannot allocate|memory allocation", re.IGNORECASE
+    r"bad_alloc|MemoryError|more memory|out ?of ?memory|cannot allocate|memory allocation|failed to map segment",
+    re.IGNORECASE,
 )
-"""What programs write when an allocation fails, in C++, in Python, in Rust, and in the XML parser Xerces."""
+"""What programs write when an allocation fails, in C++, in Python, in Rust, in the XML parser Xerces,
+and in the loader of libraries."""
 
 
 @dataclass(frozen=True)

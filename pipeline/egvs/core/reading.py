@@ -25,12 +25,16 @@ from egvs.core.files import DISK_FULL_ERRNOS
 COMPLETE_FILE = "Download or make the file again; it may be incomplete."
 """Hint for a file that cannot be read."""
 
+_ACCESS_HINT = "Check the path and the permissions."
+_MEMORY_HINT = "Use a smaller file, or a machine with more memory."
+
 
 @contextmanager
 def translate_errors(where: object, expected: str = COMPLETE_FILE, doing: str = "cannot be read") -> Iterator[None]:
     """Translate any exception of the block to an InputError.
 
-    Errors of this program are not changed, nor is that of a full disk.
+    Errors of this program are not changed, nor is that of a full disk. Where the system cannot open a file, or has too
+    little memory, the hint is about that.
 
     Parameters
     ----------
@@ -48,7 +52,10 @@ def translate_errors(where: object, expected: str = COMPLETE_FILE, doing: str = 
     except OSError as error:
         if error.errno in DISK_FULL_ERRNOS:
             raise
-        raise InputError(where, f"{doing} ({describe_exception(error)})", expected) from error
+        hint = expected if error.errno is None else _ACCESS_HINT  # without a number, it is about the content
+        raise InputError(where, f"{doing} ({describe_exception(error)})", hint) from error
+    except MemoryError as error:
+        raise InputError(where, f"{doing} ({describe_exception(error)})", _MEMORY_HINT) from error
     except Exception as error:
         raise InputError(where, f"{doing} ({describe_exception(error)})", expected) from error
 

@@ -1,7 +1,8 @@
 """The arms of a junction: the roads for cars that meet there.
 
 An arm is one road, whether it is a single edge, two edges in opposite directions, or the two carriageways of a divided
-road, which reach other nodes.
+road, which reach other nodes. Lanes for turning that leave their road before the junction, or join it behind, belong to
+its arm.
 """
 
 from __future__ import annotations
@@ -20,6 +21,11 @@ _ARM_M = 30.0
 
 _SAME_ARM_DEG = 45.0
 """Two carriageways of the same name within this angle are one arm."""
+
+_BESIDE_DEG = 20.0
+"""One-way edges of the same direction within this angle, such as a lane for turning, are one arm."""
+
+_MIN_CROSSING = 3
 
 
 def group_arms(nodes: Collection[str], middle_m: XY, roads: Sequence[Edge]) -> list[list[Edge]]:
@@ -54,7 +60,27 @@ def group_arms(nodes: Collection[str], middle_m: XY, roads: Sequence[Edge]) -> l
             arms.append(edges)
         else:
             other += edges
-    return arms
+    whole = _join_turning_lanes(nodes, middle_m, arms)
+    return whole if len(whole) >= _MIN_CROSSING else arms  # the ramp of a motorway stays an arm
+
+
+def _join_turning_lanes(nodes: Collection[str], middle_m: XY, arms: Sequence[list[Edge]]) -> list[list[Edge]]:
+    """Return the arms, with one-way arms beside a larger one joined to it."""
+    joined: list[list[Edge]] = []
+    for arm in sorted(arms, key=lambda arm: -sum(len(edge.lanes) for edge in arm)):
+        is_entry = {edge.to_node in nodes for edge in arm}
+        other = next((road for road in joined if _is_beside(nodes, middle_m, arm[0], road)), None)
+        if len(is_entry) == 1 and other is not None:
+            other += arm
+        else:
+            joined.append([*arm])
+    return sorted(joined, key=lambda arm: arms.index(next(a for a in arms if a[0] is arm[0])))
+
+
+def _is_beside(nodes: Collection[str], middle_m: XY, edge: Edge, road: Sequence[Edge]) -> bool:
+    """Return whether an edge lies beside one of a road that leads in the same direction."""
+    same_way = [other for other in road if (other.to_node in nodes) == (edge.to_node in nodes)]
+    return any(_turned_deg(middle_m, edge, other) <= _BESIDE_DEG for other in same_way)
 
 
 def _are_carriageways(nodes: Collection[str], middle_m: XY, arm: Sequence[Edge], other: Sequence[Edge]) -> bool:
@@ -70,8 +96,13 @@ def is_same_street(middle_m: XY, edge: Edge, other: Edge) -> bool:
     """Return whether two edges have the same name and lead in about the same direction from a junction."""
     if edge.name != other.name:
         return False
+    return _turned_deg(middle_m, edge, other) <= _SAME_ARM_DEG
+
+
+def _turned_deg(middle_m: XY, edge: Edge, other: Edge) -> float:
+    """Return the angle between two edges from a junction, 0 to 180 degrees."""
     turned_deg = _bearing_deg(middle_m, edge) - _bearing_deg(middle_m, other)
-    return abs((turned_deg + 180.0) % 360.0 - 180.0) <= _SAME_ARM_DEG
+    return abs((turned_deg + 180.0) % 360.0 - 180.0)
 
 
 def _bearing_deg(middle_m: XY, edge: Edge) -> float:

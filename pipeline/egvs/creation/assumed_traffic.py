@@ -85,9 +85,10 @@ class AssumedTraffic:
         if self.level is None:
             carried = "all" if self.capacity.is_everything else f"{self.carried_per_h:,}"
             return f"carries {carried} of the {self.assumed_per_h:,} requested vehicles an hour"
-        at_least = "at least " if self.capacity.is_everything else ""
+        carried = f"{self.carried_per_h:,}"
+        carried = f"at least {carried}" if self.capacity.is_everything else f"{carried} of {self.assumed_per_h:,}"
         share = format_percent(TRAFFIC_LEVELS[self.level], 0)
-        return f"carries {at_least}{self.carried_per_h:,} vehicles an hour; {self.level} {share} is used"
+        return f"carries {carried} vehicles an hour; {self.level} {share} is used"
 
     @property
     def notes(self) -> list[str]:
@@ -104,8 +105,6 @@ class AssumedTraffic:
                 "Traffic jams occur in"
                 f" {by_number(len(capacity.runs), 'the trial', f'all {len(capacity.runs)} trials')}{jam}. {hint}"
             ]
-        if not capacity.is_everything:
-            return [f"The junction does not carry the {self.assumed_per_h:,} vehicles an hour of its road classes."]
         return []
 
     @property
@@ -118,7 +117,7 @@ class AssumedTraffic:
     def describe(self) -> str:
         """Return a sentence."""
         movements = number_of(len(self.flows), "movement")
-        return f"the junction {self.summary}: {self.per_h:,} vehicles an hour in {movements} (assumed)"
+        return f"the region {self.summary}: {self.per_h:,} vehicles an hour in {movements} (assumed)"
 
     def warnings(self, scenario_file: Path) -> Iterator[str]:
         """Warn that the traffic is not counted."""

@@ -384,6 +384,23 @@ def largest_junctions(streets: Streets) -> list[StreetJunction]:
     return sorted(candidates, key=lambda j: (not j.signalised, -j.lanes_in, -j.area.area, j.id))
 
 
+def distinct_crossings(streets: Streets) -> list[StreetJunction]:
+    """Return the junctions of at least three roads for cars, the largest first.
+
+    Where carriageways of the same streets meet at several nodes, only the largest of these counts.
+    """
+    distinct: list[StreetJunction] = []
+    for junction in largest_junctions(streets):
+        if junction.is_crossing and not any(_have_same_streets(junction, other) for other in distinct):
+            distinct.append(junction)
+    return distinct
+
+
+def _have_same_streets(junction: StreetJunction, other: StreetJunction) -> bool:
+    is_near = math.dist(junction.at_m, other.at_m) <= SIGNALS_WITHIN_M
+    return is_near and len(junction.names) > 1 and junction.title == other.title
+
+
 @dataclass(frozen=True)
 class NearbyJunction:
     """A junction, and the distance of its area or its node from a point, whichever is nearer."""

@@ -585,9 +585,8 @@ def _choose_vehicles(draft: _Draft) -> ScenarioTraffic:
     try:
         return assumed_traffic.assume_traffic(draft.plan.network, streets, draft.junction, options.traffic)
     except SumoInputError as error:
-        lines = " ".join(line.strip() for line in str(error).splitlines()).rstrip(":.")
         hint = "Check the map, e.g. its traffic lights and connections in netedit."
-        raise InputError(draft.files.roads.path, f"SUMO cannot simulate the network ({lines})", hint) from None
+        raise error.for_input(draft.files.roads.path, "SUMO cannot simulate the network", hint) from None
 
 
 def _write_scenario(draft: _Draft) -> NewScenario:
@@ -750,7 +749,7 @@ def _choose_junction(
 
 def _describe_others(streets: Streets) -> tuple[str, ...]:
     """Return the junctions that follow the largest one, each with the option that chooses it."""
-    largest = [junction for junction in junctions.largest_junctions(streets) if junction.is_crossing]
+    largest = junctions.distinct_crossings(streets)
     return tuple(f"{junction.title} (--at {_at_option(streets, junction.at_m)})" for junction in largest[1:])
 
 
@@ -846,7 +845,7 @@ def _range_notes(counts: ImportCounts) -> list[str]:
         return []
     total = left_out + counts.objects.total() - counts.objects["tree_crown"]
     range_m = CATALOGUE[SENSOR].range_m
-    reason = f"they are beyond the range of a {SENSOR} ({range_m:g} m) from the region of interest and change no score."
+    reason = f"more than {range_m:g} m (the range of a {SENSOR}) from the region of interest."
     return [
         f"{left_out:,} of {number_of(total, 'static object')} {by_number(left_out, 'is', 'are')} left out: {reason}"
     ]
@@ -866,24 +865,17 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
     if not junction_fits:
         notes.append(f"The junction is larger than the region of interest (at most {junctions.ROI_MAX_M:g} m).")
     heights = counts.heights.get("building", Counter())
-    if heights["default"]:
-        notes.append(
-            f"{heights['default']} of {number_of(heights.total(), 'building')}"
-            f" {by_number(heights['default'], 'has', 'have')} neither height nor levels:"
-            f" {DEFAULT_BUILDING_M:g} m assumed."
-        )
-    if heights[NEIGHBOURS]:
-        notes.append(
-            f"{heights[NEIGHBOURS]} of {number_of(heights.total(), 'building')}"
-            f" {by_number(heights[NEIGHBOURS], 'has', 'have')} neither height nor levels: the median height of"
-            " the buildings near by assumed."
-        )
-    if heights[SURFACE_MODEL]:
-        notes.append(
-            f"{heights[SURFACE_MODEL]} of {number_of(heights.total(), 'building')}"
-            f" {by_number(heights[SURFACE_MODEL], 'has', 'have')} neither height nor levels: their heights are"
-            " those of the surface model above the terrain."
-        )
+    origins = {
+        "default": f"{DEFAULT_BUILDING_M:g} m assumed",
+        NEIGHBOURS: "the median height of the buildings near by assumed",
+        SURFACE_MODEL: "the surface model above the terrain used",
+    }
+    used = {origin: heights[key] for key, origin in origins.items() if heights[key]}
+    if used:
+        number, total = sum(used.values()), number_of(heights.total(), "building")
+        sources = [f"{origin} for {count}" if len(used) > 1 else origin for origin, count in used.items()]
+        have = by_number(number, "has", "have")
+        notes.append(f"{number} of {total} {have} neither height nor levels: {', '.join(sources)}.")
     return notes
 
 

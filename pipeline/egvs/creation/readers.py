@@ -18,7 +18,7 @@ READERS = (
         "map",
         "egvs.creation.sumo_network",
         suffixes=with_gzip(".net.xml"),
-        head=rb"<net ",
+        head=rb"<net[\s>]",
         gives=("roads",),
     ),
 )

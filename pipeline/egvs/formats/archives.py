@@ -2,8 +2,11 @@
 
 Another process (:mod:`egvs.formats.reader_process`) unpacks the members; this one writes them to a temporary folder
 that is named like the archive. Members whose names lead out of it, links, encrypted members and two members of one
-name are errors; archives inside of archives stay packed. Messages name the archive and the member, never the temporary
-folder.
+name are errors. ZIP archives inside of archives are unpacked to folders as well, up to :data:`MAX_DEPTH`. Messages name
+the archive and the member, never the temporary folder.
+
+Beside the suffix, the first bytes tell an archive: what is named ``.zip`` but is none, such as a map in plain text, is
+left to the reader of its content, and a map that is zipped under its own name is unpacked.
 """
 
 from __future__ import annotations
@@ -31,6 +34,12 @@ MAX_NAME_LENGTH = 1000
 """Largest number of characters of the path of a file in an archive."""
 
 _NAME_ERRNOS = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL)
+
+MAX_DEPTH = 3
+"""Deepest nesting of archives in archives."""
+
+_SIGNATURES = (b"PK\x03\x04", b"PK\x05\x06")
+_OTHER_ZIP_FORMATS = (".kmz", ".xlsx", ".ods", ".npz", ".usdz")
 _CHUNK_BYTES = 1 << 20
 _CANNOT_READ = "cannot be read as a ZIP archive"
 _UNPACK_HINT = "Unpack it, and give the file or the folder."
@@ -71,7 +80,7 @@ def unpack_archives(paths: Sequence[Path], suffixes: Sequence[str] = (SUFFIX,)) 
     paths
         Files and folders.
     suffixes
-        Endings of the names of archives; other files stay as they are.
+        Endings of the names of archives.
 
     Raises
     ------
@@ -82,31 +91,57 @@ def unpack_archives(paths: Sequence[Path], suffixes: Sequence[str] = (SUFFIX,)) 
     unpacked = UnpackedFiles()
     with ExitStack() as stack:
         for path in paths:
-            if path.suffix.lower() not in suffixes or not path.is_file():
+            if not _is_archive(path, suffixes):
                 unpacked.paths.append(path)
                 continue
             folder = stack.enter_context(files.temporary_folder()) / path.name
             folder.mkdir()
-            _unpack(path, folder)
             unpacked.add(path, folder)
+            with name_in_errors(unpacked.user_text):
+                _unpack(path, os.fspath(path), folder)
         with name_in_errors(unpacked.user_text):
             yield unpacked
 
 
-def _unpack(path: Path, folder: Path) -> None:
-    """Write the members of an archive to a folder."""
-    limits.checked_size(path, limits.FILE)
-    size = 0
-    for block in read_blocks(__name__, path, os.fspath(path), _CANNOT_READ):
+def _is_archive(path: Path, suffixes: Sequence[str]) -> bool:
+    suffix = path.suffix.lower()
+    if not path.is_file():
+        return False
+    if suffix in suffixes and suffix != SUFFIX:
+        return True
+    try:
+        with path.open("rb") as file:
+            is_zip = file.read(4) in _SIGNATURES
+    except OSError:
+        return suffix in suffixes  # the error names the file
+    return is_zip and suffix not in _OTHER_ZIP_FORMATS
+
+
+def _unpack(path: Path, where: str, folder: Path, size: int = 0, depth: int = 1) -> int:
+    """Write the members of an archive to a folder; return the bytes unpacked so far, ``size`` among them."""
+    limits.checked_size(path, limits.FILE, where)
+    inner: dict[Path, None] = {}
+    for block in read_blocks(__name__, path, where, _CANNOT_READ):
         name = block.values["name"]
+        target = folder.joinpath(*_parts(name, where))
         size += len(block.content)
-        limits.UNPACKED.check_bytes(path, size)
+        limits.UNPACKED.check_bytes(where, size)
         try:
-            _append(folder.joinpath(*_parts(name, path)), block.content)
+            _append(target, block.content)
         except OSError as error:
             if error.errno not in _NAME_ERRNOS:
                 raise
-            raise _name_error(path, name, f"cannot be unpacked ({error.strerror})") from None
+            raise _name_error(where, name, f"cannot be unpacked ({error.strerror})") from None
+        if target.suffix.lower() == SUFFIX:
+            inner.setdefault(target)
+    for archive in filter(zipfile.is_zipfile, inner):
+        if depth == MAX_DEPTH:
+            raise InputError(archive, f"archives are nested more than {MAX_DEPTH} deep", _UNPACK_HINT)
+        packed = archive.rename(archive.with_name(".packed"))  # no member has such a name
+        archive.mkdir()
+        size = _unpack(packed, os.fspath(archive), archive, size, depth + 1)
+        packed.unlink()
+    return size
 
 
 def _append(target: Path, content: bytes | memoryview) -> None:
@@ -119,19 +154,19 @@ def _append(target: Path, content: bytes | memoryview) -> None:
     target.touch(exist_ok=False)  # where case does not count, two members may have one name only here
 
 
-def _parts(name: str, path: Path) -> tuple[str, ...]:
+def _parts(name: str, where: object) -> tuple[str, ...]:
     """Return the parts of a member's path inside its archive; InputError when it leads out of it."""
     parts = PurePosixPath(name).parts
     if not parts or ".." in parts or name.startswith("/") or any(mark in name for mark in "\\:\0"):
         problem = f"its member {name[:80]!r} leads out of the archive"
-        raise InputError(path, problem, "Make the archive again, with relative paths.")
+        raise InputError(where, problem, "Make the archive again, with relative paths.")
     if len(name) > MAX_NAME_LENGTH:
-        raise _name_error(path, name, f"has a name of {len(name):,} characters; at most {MAX_NAME_LENGTH} are read")
+        raise _name_error(where, name, f"has a name of {len(name):,} characters; at most {MAX_NAME_LENGTH} are read")
     return parts
 
 
-def _name_error(path: Path, name: str, problem: str) -> InputError:
-    return InputError(path, f"its member {name[:80]!r} {problem}", "Make the archive again, with other names.")
+def _name_error(where: object, name: str, problem: str) -> InputError:
+    return InputError(where, f"its member {name[:80]!r} {problem}", "Make the archive again, with other names.")
 
 
 def _check_distinct(names: dict[tuple[str, ...], str], path: Path) -> None:

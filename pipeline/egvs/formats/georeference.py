@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -47,6 +48,7 @@ _SYSTEM_HINT = 'Use a name that PROJ knows, for example "EPSG:25832".'
 _MAX_SHOWN = 100
 _HEIGHT_WORDS = re.compile(r"\+(?:geoidgrids|geoid_crs|vunits|vto_meter)=[^\s\"']*\s*")
 """What a PROJ string says of heights, also inside WKT: PROJ cannot convert x and y where it lacks the named grid."""
+_GRID_WORDS = re.compile(r"\+nadgrids=[^\s\"']+\s*")
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class WorldFrame:
         if crs.is_projected:
             problem = f"has axes in {units[0]} to the {' and '.join(directions)}"
         hint = "Use a projection in metres to the east and north, for example epsg = 32632 (UTM zone 32 north)."
-        raise InputError(where, f"{projection} ({crs.name}) {problem}", hint)
+        raise InputError(where, f"{_shorten(projection)} ({crs.name}) {problem}", hint)
 
     def from_lon_lat(self, lon_lat_deg: FloatArray) -> FloatArray:
         """Convert longitude and latitude (n, 2) in degrees to world-frame x, y in metres, (n, 2) float64.
@@ -177,7 +179,9 @@ def _parse_complete(crs: Any) -> CRS:
     from pyproj.exceptions import CRSError
 
     try:
-        return CRS.from_user_input(crs)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # +init=epsg:25832 is an old form of EPSG:25832
+            return CRS.from_user_input(crs)
     except (CRSError, TypeError, ValueError):
         raise InputError("", f"unknown coordinate reference system {_shorten(str(crs))!r}", _SYSTEM_HINT) from None
 
@@ -199,21 +203,35 @@ def _no_conversion_error(crs: CRS, error: Exception) -> InputError:
     if grids:
         problem += f": the grid {grids[0]} is not installed"
         return InputError("", problem, "Name the system by its EPSG code, or install the grid with projsync.")
-    reason = re.sub(r".*Internal Proj Error: (?:\w+: )*", "", str(error)).partition(". ")[0].removesuffix(")")
+    reason = re.sub(r".*Internal Proj Error: (?:\w+: )*", "", str(error)).partition(". ")[0]
+    reason = reason.removesuffix(")" if reason.count(")") > reason.count("(") else "")
     return InputError("", f"{problem} ({reason})", _SYSTEM_HINT)
 
 
 def proj_string(crs: str, where: str) -> str:
     """Return a coordinate reference system as a PROJ string, which is all that SUMO reads; InputError if unknown."""
-    import warnings
-
     parsed = parse_crs(crs, where)
     if crs.strip().startswith("+proj="):
-        return _HEIGHT_WORDS.sub("", crs).strip()
+        text = _HEIGHT_WORDS.sub("", crs).strip()
+        return text if _has_grids(text) else _GRID_WORDS.sub("", text).strip()
     with warnings.catch_warnings():
         # a PROJ string cannot say everything, such as the names of axes
         warnings.simplefilter("ignore", UserWarning)
         return str(parsed.to_proj4())
+
+
+def _has_grids(proj_string: str) -> bool:
+    """Return whether PROJ has the grids that a string names; parse_crs rejects a system that needs those it lacks."""
+    from pyproj import Proj
+    from pyproj.exceptions import ProjError
+
+    if _GRID_WORDS.search(proj_string) is None:
+        return True
+    try:
+        Proj(proj_string)
+    except ProjError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)

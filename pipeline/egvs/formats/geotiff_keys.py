@@ -22,7 +22,7 @@ _GEOGRAPHIC, _GEOGRAPHIC_CITATION, _DATUM, _MERIDIAN, _ANGLE_UNIT = 2048, 2049, 
 _ELLIPSOID, _HALF_AXIS, _OTHER_HALF_AXIS, _INVERSE_FLATTENING = 2056, 2057, 2058, 2059
 _PROJECTED, _PROJECTED_CITATION, _CONVERSION, _METHOD, _UNIT, _UNIT_SIZE = 3072, 3073, 3074, 3075, 3076, 3077
 _VERTICAL, _VERTICAL_CITATION, _VERTICAL_UNIT = 4096, 4097, 4099
-_GEOCENTRIC_MODEL, _GREENWICH = 3, 8901
+_PROJECTED_MODEL, _GEOGRAPHIC_MODEL, _GEOCENTRIC_MODEL, _GREENWICH = 1, 2, 3, 8901
 
 _OLD_VERTICAL = {5101: 5701, 5102: 5702, 5103: 5703, 5104: 5704, 5105: 5705, 5106: 5706}
 """EPSG codes for those of GeoTIFF 1.0; it gives ellipsoids the codes from 5001 to 5033."""
@@ -149,10 +149,12 @@ class GeoKeys:
         unit = self._unit(_UNIT, _UNIT_SIZE)
         code = self._code(_PROJECTED)
         if code is not None:
-            return _with_unit(_from_epsg(code, "ProjectedCRS"), unit)
+            system = _from_epsg(code, "ProjectedCRS", "CompoundCRS")
+            return _with_unit(system["components"][0] if system["type"] == "CompoundCRS" else system, unit)
         conversion = self._conversion(unit)
         if conversion is None:
-            if self.values.get(_MODEL_TYPE) == 2 or _PROJECTED not in self.values:
+            model = self.values.get(_MODEL_TYPE)
+            if model == _GEOGRAPHIC_MODEL or (_PROJECTED not in self.values and model != _PROJECTED_MODEL):
                 return self._geographic()
             return None if unit is None else _local(self._text(_PROJECTED_CITATION, _CITATION, default="local"), unit)
         base = self._geographic()
@@ -273,7 +275,15 @@ class GeoKeys:
         if horizontal["type"] not in ("ProjectedCRS", "GeographicCRS"):
             return None
         if code is not None and code not in _NO_VERTICAL_CODE:
-            return _with_unit(_from_epsg(_OLD_VERTICAL.get(code, code), "VerticalCRS"), unit)
+            system = _from_epsg(_OLD_VERTICAL.get(code, code), "VerticalCRS", "GeographicCRS")
+            if system["type"] == "VerticalCRS":
+                return _with_unit(system, unit)
+            if len(system["coordinate_system"]["axis"]) < 3:  # GeoTIFF 1.1 permits 3D systems
+                raise ValueError(f"its GeoTIFF keys name EPSG:{code} as a VerticalCRS, but it has no heights")
+            unit = unit or _METRE
+        compound = self._compound()
+        if compound is not None and code is None:
+            return _with_unit(compound["components"][1], unit)
         if unit is None:
             return None
         name = self._text(_VERTICAL_CITATION, default="heights of the GeoTIFF keys")
@@ -284,6 +294,12 @@ class GeoKeys:
             "datum": {"type": "VerticalReferenceFrame", "name": name},
             "coordinate_system": {"subtype": "vertical", "axis": [axis]},
         }
+
+    def _compound(self) -> dict[str, Any] | None:
+        """Return the system of the code of x and y, if it is one with heights."""
+        code = self._code(_PROJECTED)
+        system = None if code is None else _from_epsg(code, "ProjectedCRS", "CompoundCRS")
+        return system if system is not None and system["type"] == "CompoundCRS" else None
 
 
 _METRE: dict[str, Any] = {"type": "LinearUnit", "name": "metre", "conversion_factor": 1.0}

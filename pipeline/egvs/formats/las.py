@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
@@ -164,20 +165,49 @@ def crs_of(path: Path, where: str) -> str | None:
     For a file that :func:`read` has read. InputError at ``where`` when the declaration is damaged, or states something
     that PROJ cannot use.
     """
+    declared = _declared_systems(path)
+    if declared.wkt and (declared.prefers_wkt or not declared.has_keys):
+        return declared.wkt
+    try:
+        return declared.keys.to_crs() or declared.wkt or None
+    except ValueError as error:
+        if declared.wkt:
+            return declared.wkt
+        hint = "Write its reference system as WKT, for example with pdal translate --writers.las.a_srs=EPSG:CODE."
+        raise InputError(where, str(error), hint) from None
+
+
+def other_crs_of(path: Path) -> str | None:
+    """Return the system of the record that does not count, where a file has both kinds; else None."""
+    declared = _declared_systems(path)
+    if not declared.wkt or not declared.has_keys:
+        return None
+    with suppress(ValueError):
+        return declared.keys.to_crs() if declared.prefers_wkt else declared.wkt
+    return None
+
+
+class _DeclaredSystems(NamedTuple):
+    """What the records of a file say of its reference system, and which kind the header prefers."""
+
+    wkt: str
+    records: dict[int, bytes]
+    has_keys: bool
+    prefers_wkt: bool
+
+    @property
+    def keys(self) -> GeoKeys:
+        """The GeoTIFF keys; ValueError when one points beyond its record."""
+        return GeoKeys.from_records(self.records)
+
+
+def _declared_systems(path: Path) -> _DeclaredSystems:
     with path.open("rb") as file:
         head = file.read(375)
         records = _projection_records(file, head)
     wkt = records.get(_WKT_RECORD, b"").decode("utf-8", "replace").strip("\0 \t\r\n\"'")
     prefers_wkt = bool(struct.unpack_from("<H", head, 6)[0] & _WKT_FLAG)
-    if wkt and (prefers_wkt or not records.get(_KEY_RECORDS[0])):
-        return wkt
-    try:
-        return GeoKeys.from_records(records).to_crs() or wkt or None
-    except ValueError as error:
-        if wkt:
-            return wkt
-        hint = "Write its reference system as WKT, for example with pdal translate --writers.las.a_srs=EPSG:CODE."
-        raise InputError(where, str(error), hint) from None
+    return _DeclaredSystems(wkt, records, bool(records.get(_KEY_RECORDS[0])), prefers_wkt)
 
 
 class _RecordTable(NamedTuple):

@@ -1,7 +1,8 @@
 r"""Read PCD files (Point Cloud Library) with DATA ascii, binary or binary_compressed; write them as DATA binary.
 
-Fields may be in any order, of any TYPE, SIZE and COUNT. A VIEWPOINT other than the identity is the sensor's pose in the
-world; the points, in the sensor's frame in metres, are then converted to the world frame:
+Fields may be in any order, of any TYPE, SIZE and COUNT; old files call them COLUMNS. A VIEWPOINT other than the
+identity is the sensor's pose in the world; the points, in the sensor's frame in metres, are then converted to the world
+frame:
 
 .. math:: p_\mathrm{world} = R(q)\, p_\mathrm{sensor} + t, \qquad
           \mathrm{VIEWPOINT} = t_x\, t_y\, t_z\, q_w\, q_x\, q_y\, q_z.
@@ -97,10 +98,23 @@ def _read_fields(where: str, data: bytes, header: _Header, names: Sequence[str])
         case ["binary"]:
             return layout.from_records(memoryview(data)[header.data_start :])
         case ["binary_compressed"]:
-            return layout.from_blocks(_unpack(where, data[header.data_start :], layout.n * layout.size))
+            body = data[header.data_start :]
+            packed = _layout(where, _without_padding(header.words), names)
+            if len(body) >= 8 and struct.unpack_from("<I", body, 4)[0] == packed.n * packed.size:
+                layout = packed
+            return layout.from_blocks(_unpack(where, body, layout.n * layout.size))
         case other:
             problem = f"DATA: expected ascii, binary or binary_compressed, got {' '.join(other)[:60]!r}"
             raise InputError(where, problem, "Convert the file to one of these.")
+
+
+def _without_padding(words: dict[str, list[str]]) -> dict[str, list[str]]:
+    """Return a header without the fields ``_``, the padding of records, for which PCL writes no blocks."""
+    names = words["FIELDS"]
+    rows = {key: words[key] for key in ("FIELDS", "SIZE", "TYPE", "COUNT") if key in words}
+    return words | {
+        key: [word for name, word in zip(names, row, strict=True) if name != "_"] for key, row in rows.items()
+    }
 
 
 def stream(path: Path, where: str) -> Iterator[PointChunk]:
@@ -147,7 +161,7 @@ def _read_header(where: str, data: bytes) -> _Header:
         if keyword and not keyword.startswith("#"):
             if not (line.isascii() and line.replace("\t", " ").rstrip("\r").isprintable()):
                 raise InputError(f"{where}: line {lines + 1}", f"expected text, got {line[:80]!r}", COMPLETE_FILE)
-            words[keyword] = values
+            words["FIELDS" if keyword == "COLUMNS" else keyword] = values
         start = end + 1
         lines += 1
     return _Header(words, start, lines)

@@ -266,6 +266,18 @@ def point_cloud_crs(path: Path, where: str) -> str | None:
     return crs
 
 
+def other_point_cloud_crs(path: Path, where: str) -> str | None:
+    """Return a second reference system that a point cloud declares, and that does not count; None if it is unknown."""
+    where = _with_path(where, path)
+    point_format = _load_format(_find_reader(path, where))
+    other_crs_of = getattr(point_format, "other_crs_of", None)
+    with suppress(InputError):
+        if other_crs_of is not None and (crs := other_crs_of(path)) is not None:
+            parse_crs(crs, where)
+            return str(crs)
+    return None
+
+
 def format_of_file(path: Path, where: str) -> str:
     """Return the module that reads files with this suffix; InputError at ``where`` if no reader knows the suffix."""
     return _find_reader(path, _with_path(where, path)).module
@@ -404,7 +416,7 @@ class RecordLayout:
         last
             Whether nothing may follow the points.
         """
-        rows = [(number, row) for number, row in enumerate(text.splitlines(), line) if row.strip()][skip:]
+        rows = [(number, row) for number, row in enumerate(text.splitlines(), line) if row.strip(PADDING)][skip:]
         if len(rows) < self.n or (last and len(rows) > self.n):
             raise InputError(
                 self.where,

@@ -5,28 +5,27 @@ Text is UTF-8, UTF-16 with a byte order mark, or Windows-1252. The first row wit
 and columns without any value are skipped, as spreadsheets keep those that were emptied.
 
 ``8,5`` is the number 8.5. Where each such cell of a table could also be a number of thousands (``1,500``), the table is
-rejected.
+rejected; so is one with decimal commas where each cell with a point could be (``1.500``).
 
-Workbooks (xlsx, xls, ods) are read by calamine (``pip install 'egvs[tables]'``) in another process
-(:mod:`egvs.formats.reader_process`), which this module also is the program of. The values that a spreadsheet has
-computed are read, not the formulas. Of several sheets, one must have the header that is expected.
+Workbooks (xlsx, xls, ods) are read by :mod:`egvs.formats.workbooks`. Of several sheets, one must have the expected
+header.
 """
 
 from __future__ import annotations
 
 import csv
-import datetime
 import io
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from egvs.core import limits, plugins
+from egvs.core import limits
 from egvs.core.errors import InputError, raise_together
 from egvs.core.wording import list_first
+from egvs.formats import workbooks
+from egvs.formats.workbooks import MAX_COLUMNS
 
 CheckHeader = Callable[[list[str]], list[str]]
 """Returns the names of columns under which values are given; raises an InputError where they are not valid."""
@@ -34,14 +33,14 @@ CheckHeader = Callable[[list[str]], list[str]]
 Parsed = TypeVar("Parsed")
 
 SUFFIXES = (".csv", ".xlsx", ".xls", ".ods")
-MAX_COLUMNS = 500
-_MODULE = "egvs.formats.spreadsheets"
 _WORKBOOK_SIGNATURES = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1")  # ZIP (xlsx, ods), OLE (xls)
 _CONTROL_CHARACTER = re.compile("[\x00-\x08\x0e-\x1f]")
 _SEPARATORS = (",", ";", "\t")
 _SEPARATOR_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
 _COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
-_THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
+_THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}[,.][0-9]{3}")
+_POINT_NUMBER = re.compile(r"[+-]?[0-9]+\.[0-9]+([eE][+-]?[0-9]+)?")
+_MARKUP = re.compile(r"\s*<(?:[!?]|html|table)", re.IGNORECASE)
 _SAVE_HINT = "Save it as CSV in UTF-8."
 _MAX_NAMED = 5
 
@@ -146,7 +145,13 @@ def _make_table(where: str, unit: str, rows: Iterable[tuple[int, list[str]]]) ->
     rows = [(number, cells) for number, cells in rows if any(cells)]
     if not rows:
         raise InputError(where, "expected a header and rows, got no values", "Write one row per item.")
-    header = rows.pop(0)[1]
+    first, header = rows.pop(0)
+    titles = [cell for cell in header if cell]
+    if len(titles) == 1 and rows and sum(map(bool, rows[0][1])) > 1:
+        problem = f"expected the names of the columns, got {titles[0][:80]!r} alone"
+        raise InputError(
+            f"{where}: {unit} {first}", problem, "Remove what is above the names, or check the separators."
+        )
     if len(header) > MAX_COLUMNS:
         problem = f"expected at most {MAX_COLUMNS} columns, got {len(header):,}"
         raise InputError(where, problem, "Remove columns that are not needed.")
@@ -169,21 +174,29 @@ def _make_table(where: str, unit: str, rows: Iterable[tuple[int, list[str]]]) ->
 
 
 def _use_decimal_points(table: _Table) -> None:
-    """Replace decimal commas by points; InputError where each of them could separate thousands."""
-    with_comma = [
+    """Replace decimal commas by points; InputError where they, or the points beside them, can separate thousands."""
+    with_comma = _find_cells(table, _COMMA_NUMBER)
+    if not with_comma:
+        return
+    for numbers in (with_comma, _find_cells(table, _POINT_NUMBER)):
+        if numbers and all(_THOUSANDS.fullmatch(cells[column]) for _, column, cells in numbers):
+            number, column, cells = numbers[0]
+            value = cells[column]
+            problem = f"{value} can mean {re.sub('[,.]', '', value)} or {value.replace(',', '.')}"
+            where = f"{table.locate(number)}: {table.header[column]}"
+            raise InputError(where, problem, "Use no separators of thousands, and a decimal point.")
+    for _, column, cells in with_comma:
+        cells[column] = cells[column].replace(",", ".")
+
+
+def _find_cells(table: _Table, pattern: re.Pattern[str]) -> list[tuple[int, int, list[str]]]:
+    """Return row number, column and row of each cell that a pattern matches."""
+    return [
         (number, column, cells)
         for number, cells in table.rows
         for column, cell in enumerate(cells)
-        if "," in cell and _COMMA_NUMBER.fullmatch(cell)
+        if pattern.fullmatch(cell)
     ]
-    if with_comma and all(_THOUSANDS.fullmatch(cells[column]) for _, column, cells in with_comma):
-        number, column, cells = with_comma[0]
-        value = cells[column]
-        problem = f"{value} can mean {value.replace(',', '')} or {value.replace(',', '.')}"
-        where = f"{table.locate(number)}: {table.header[column]}"
-        raise InputError(where, problem, "Use no separators of thousands, and a decimal point.")
-    for _, column, cells in with_comma:
-        cells[column] = cells[column].replace(",", ".")
 
 
 # ---- text
@@ -191,6 +204,8 @@ def _use_decimal_points(table: _Table) -> None:
 
 def _read_text(path: Path, data: bytes) -> _Table:
     text = _decode(path, data)
+    if _MARKUP.match(text):
+        raise InputError(path, "expected a table, got HTML or XML", "Save it as a workbook (xlsx) or as CSV.")
     first_line, _, rest = text.partition("\n")
     skipped = 0
     named = _SEPARATOR_LINE.fullmatch(first_line.strip(" \r"))
@@ -203,11 +218,20 @@ def _read_text(path: Path, data: bytes) -> _Table:
             raise InputError(path, "the columns are separated by '|'", "Use commas or semicolons.")
     table = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True, strict=True)
     try:
-        rows = [(table.line_num + skipped, cells) for cells in table]
+        rows = [(table.line_num + skipped, cells) for cells in _rows_with_values(path, table)]
     except csv.Error as error:
         line = table.line_num + skipped
         raise InputError(f"{path}: line {line}", f"is not CSV ({error})", "Check the quotes.") from None
     return _make_table(str(path), "line", rows)
+
+
+def _rows_with_values(path: Path, table: Iterable[list[str]]) -> Iterator[list[str]]:
+    count = 0
+    for cells in table:
+        if any(cells):
+            count += 1
+            workbooks.check_row_count(path, count)
+            yield cells
 
 
 def _decode(path: Path, data: bytes) -> str:
@@ -253,66 +277,7 @@ def _choose_sheet(path: Path, sheets: list[_Table], check_header: CheckHeader) -
 
 def _read_workbook(path: Path) -> Iterator[_Table]:
     """Yield the visible sheets that have values."""
-    plugins.require_libraries(f"{path.name}: reading a workbook", "tables", "python_calamine")
-    from egvs.formats.reader_process import read_blocks
-
-    sheets: dict[str, list[tuple[int, list[str]]]] = {}
-    size = 0
-    for block in read_blocks(_MODULE, path, str(path), "cannot be read as a workbook"):
-        size += len(block.content)
-        limits.DOCUMENT.check_bytes(path, size, f"has tables of {size / limits.MB:,.0f} MB")
-        sheets.setdefault(block.values["sheet"], []).append((block.values["row"], json.loads(bytes(block.content))))
+    sheets = workbooks.read_sheets(path)
     for name, rows in sheets.items():
         where = str(path) if len(sheets) == 1 else f"{path}: sheet {name!r}"
         yield _make_table(where, "row", rows)
-
-
-def _serve_workbook() -> None:
-    from python_calamine import CalamineWorkbook, SheetTypeEnum, SheetVisibleEnum
-
-    from egvs.formats.reader_process import Block, serve
-
-    def read(path: Path) -> Iterator[Block]:
-        book = CalamineWorkbook.from_path(path)
-        for sheet in book.sheets_metadata:
-            if sheet.visible != SheetVisibleEnum.Visible or sheet.typ != SheetTypeEnum.WorkSheet:
-                continue
-            content = book.get_sheet_by_name(sheet.name)
-            if content.start is None or content.end is None:
-                continue
-            columns = content.end[1] + 1 - content.start[1]
-            if columns > MAX_COLUMNS:
-                problem = f"expected at most {MAX_COLUMNS} columns, got {columns:,}"
-                raise InputError(f"{path}: sheet {sheet.name!r}", problem, "Remove columns that are not needed.")
-            rows = enumerate(content.iter_rows(), start=content.start[0] + 1)
-            for number, cells in rows:
-                texts = [_cell_text(cell) for cell in cells]
-                if any(texts):
-                    yield Block({"sheet": sheet.name, "row": number}, json.dumps(texts).encode())
-
-    serve(read)
-
-
-def _cell_text(value: object) -> str:
-    """Return a cell as it would be written in CSV."""
-    match value:
-        case bool():
-            return str(value).lower()
-        case float() if value.is_integer() and abs(value) < 1e15:
-            return str(int(value))
-        case datetime.timedelta():
-            minutes, seconds = divmod(round(value.total_seconds()), 60)
-            return _clock_text(minutes // 60, minutes % 60, seconds)
-        case datetime.datetime() | datetime.date():
-            return value.isoformat()
-        case datetime.time():
-            return _clock_text(value.hour, value.minute, value.second)
-    return str(value)
-
-
-def _clock_text(hours: int, minutes: int, seconds: int) -> str:
-    return f"{hours:02d}:{minutes:02d}" + (f":{seconds:02d}" if seconds else "")
-
-
-if __name__ == "__main__":
-    _serve_workbook()

@@ -104,7 +104,8 @@ def read_gis_file(path: Path, geometry: str) -> dict[str, Any]:
 def _layer_in(folder: Path) -> Path:
     """Return the only GIS file of an unpacked archive; of a KMZ, the one that its standard names."""
     if not folder.is_dir():
-        raise InputError(folder, "expected a file", "Check the path.")
+        problem = "expected a ZIP archive, got other content" if folder.is_file() else "expected a file"
+        raise InputError(folder, problem, "Check the path and the suffix.")
     inside = sorted(path for path in folder.rglob("*") if path.suffix.lower() in GIS_FORMATS)
     if folder.suffix.lower() == ".kmz":
         inside = [path for path in inside if path == folder / _KMZ_FILE] or inside

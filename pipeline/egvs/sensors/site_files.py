@@ -32,6 +32,7 @@ from egvs.core.numbers import parse_decimal
 from egvs.core.reading import read_json
 from egvs.formats import spreadsheets, vector_files
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference, declared_crs, geojson_coordinates
+from egvs.formats.workbooks import MAX_COLUMNS
 from egvs.scenario.fields import same_name
 
 REQUIRED_COLUMNS = ("site", "x_m", "y_m", "z_m")
@@ -125,8 +126,8 @@ def check_site_count(count: float, where: object, reason: str, hint: str = _FEWE
 
 def _check_column_count(path: Path, names: Collection[str]) -> None:
     """Raise an InputError when the sites of a file have too many columns: each is compared with the known ones."""
-    if len(names) > spreadsheets.MAX_COLUMNS:
-        problem = f"expected at most {spreadsheets.MAX_COLUMNS} columns, got {len(names):,}"
+    if len(names) > MAX_COLUMNS:
+        problem = f"expected at most {MAX_COLUMNS} columns, got {len(names):,}"
         raise InputError(path, problem, "Remove columns that describe no site.")
 
 

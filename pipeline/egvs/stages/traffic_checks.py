@@ -185,6 +185,23 @@ def check_internal_edges(inputs: CheckInputs) -> Iterator[Diagnostic]:
 
 
 @_for_each_period
+def warn_map_as_network(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about a network that is an OpenStreetMap file."""
+    scenario = inputs.scenario
+    try:
+        path = sumo_folder.network_path(scenario)
+        is_map = path is not None and network.is_osm(path)
+    except InputError:
+        return  # check_times or the checks of the scene report it
+    if path is not None and is_map and not scenario.traffic.is_finished:
+        problem = (
+            f"{path.name} is a map: traffic is taken to drive on the right, and turns are not compared with the map's"
+        )
+        hint = f"Make the network with egvs new NAME --from {path.name}, and use its network.net.xml."
+        yield Diagnostic("map as network", sumo_folder.traffic_location(scenario), problem, hint)
+
+
+@_for_each_period
 def check_signals(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report plans of signals that do not fit the network."""
     traffic = inputs.scenario.traffic

@@ -98,6 +98,9 @@ _MAX_ROUTE_CHANGE = 50
 
 _MIN_SECONDS = 1e-3
 
+_ONE_PLACE_M = 30.0
+"""Roads that end within this distance of each other are one access of a network."""
+
 
 @dataclass(frozen=True)
 class OriginDestinations:
@@ -566,13 +569,14 @@ class RouteFinder:
         self._sources, self._sinks = self._find_ends()
 
     def _find_ends(self) -> tuple[IntArray, IntArray]:
-        """Return the edges where routes start and end; none where all are at one node, so that no route leads through.
+        """Return the edges where routes start and end; none where all are at one place, so that no route leads through.
 
-        Without ends, routes start and end where vehicles are counted.
+        The carriageways of the only access road end at two nodes beside each other. Without ends, routes start and end
+        where vehicles are counted.
         """
         sources, sinks = fringe_edges(self._lanes, self._links)
-        nodes = {self._edges[i].from_node for i in sources} | {self._edges[i].to_node for i in sinks}
-        if len(nodes) < 2:
+        ends_m = [self._edges[i].start_m[:2] for i in sources] + [self._edges[i].end_m[:2] for i in sinks]
+        if not ends_m or np.ptp(np.array(ends_m), axis=0).max() < _ONE_PLACE_M:
             return sources[:0], sinks[:0]
         return sources, sinks
 

@@ -194,7 +194,7 @@ def sizes_of_types(
         except sumo.SumoInputError as error:
             where = ", ".join(map(str, size_files(scenario))) or sumo_folder.traffic_location(scenario)
             hint = "Use types that SUMO can read."
-            raise InputError(where, f"SUMO rejects the vehicle types: {error}", hint) from None
+            raise error.for_input(where, "SUMO rejects the vehicle types", hint) from None
         add(queried, _SUMO_DEFAULT)
         vtype_names = {vtype.attrib["id"] for vtype in vtypes}
         add({name: size for name, size in queried.items() if name in vtype_names}, _VTYPES)

@@ -298,7 +298,7 @@ def _record_simulated(
         seconds, peak_mb = simulate(prepared, progress, watch)
     except sumo.SumoInputError as error:
         hint = "Correct these files; SUMO read copies of them."
-        raise InputError(where, f"SUMO cannot run {sources}: {error}", hint) from None
+        raise error.for_input(where, f"SUMO cannot run {sources}", hint) from None
     else:
         collisions = _read_collisions(prepared)
         fits, warnings = _compare_counts(scenario, prepared)

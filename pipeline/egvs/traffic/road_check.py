@@ -1,13 +1,15 @@
 """Compare recorded vehicles with the roads: FCD files and tracks alike.
 
 Wrong coordinates, another convention of angles, a mirrored map or shared names give a complete result that is wrong.
-Four things are counted, of motor vehicles in and around the region of interest:
+Five things are counted, of motor vehicles in and around the region of interest:
 
 - *off their lanes*: positions of moving vehicles more than :data:`BESIDE_M` beside every lane that leads their way, to
   :data:`SAME_WAY_DEG`. Beyond the region of interest, only positions within the bounds of all lanes count: a network
   may end there. In a network without lanes inside junctions, a junction is a lane in all directions;
 - *against the lanes*: positions on lanes that all lead the other way, outside of junctions;
 - *headings*: headings that are more than :data:`ACROSS_DEG` off the motion;
+- *jumps over junctions*: steps from one side of a junction to the other, in a file without positions inside
+  junctions; SUMO writes such files from networks without internal links;
 - *shared names*: rows of one vehicle at one time in two places, and steps that no vehicle can make.
 
 A vehicle moves if it is at least :data:`MIN_MOTION_M` away after :data:`BASE_S`, and faster than :data:`MOVING_M_S`.
@@ -91,11 +93,18 @@ STRETCH_M, MIN_TOP_M_S, MIN_WAY_M, MIN_WAYS_M = 3.0, 2.5, 30.0, 100.0
 """If nine of ten vehicles are slower than this on each stretch of their way, times are no seconds. Ways of at least
 this length count, if they are this long together."""
 
+MIN_JUMP_OVER_M, MAX_INSIDE_SHARE = 5.0, 0.1
+"""Vehicles jump over a junction if this much of a step is inside it. In complete files, moving vehicles are inside
+junctions in more rows than this share of such steps."""
+
 MIN_POSITIONS = 20
 """Shares of fewer positions are only warnings."""
 
 _MAX_POSITIONS = 4000
 """Positions of each table that are compared with lanes."""
+
+_MAX_STEPS, _SAMPLES = 20_000, 10
+"""Steps of each table that are compared with junctions, and points on each of them."""
 
 
 @dataclass
@@ -125,6 +134,8 @@ class RoadCheck:
         Speed over the limit of the lane, and speed, of positions on lanes, of each table.
     top_speeds_m_s, ways_m
         Speed on the fastest stretch of the way of each vehicle, and the length of the way, of each table.
+    inside_junctions, jumps_over_junctions
+        Moving vehicles inside junctions, and steps over junctions.
     names
         Signs of shared names.
     lengths_m
@@ -148,6 +159,8 @@ class RoadCheck:
     speeds_m_s: list[FloatArray] = field(default_factory=list)
     top_speeds_m_s: list[FloatArray] = field(default_factory=list)
     ways_m: list[FloatArray] = field(default_factory=list)
+    inside_junctions: int = 0
+    jumps_over_junctions: int = 0
     names: SharedNames = field(default_factory=SharedNames)
     lengths_m: Mapping[str, float] = field(default_factory=dict)
     reference: ReferencePoints = field(default_factory=ReferencePoints)
@@ -177,6 +190,7 @@ class RoadCheck:
 
         near = is_motor & self._is_around(xy_m, AROUND_M)
         self._add_top_speeds(vehicle[near], time_ms[near] / 1000.0, xy_m[near])
+        self._count_jumps_over_junctions(vehicle[near], xy_m[near])
 
         first, second, motion_m = _motions(vehicle, time_ms, xy_m)
         counts = is_motor[first] & self._is_around(xy_m[first], AROUND_M)
@@ -220,6 +234,20 @@ class RoadCheck:
         self.headings += len(off_deg)
         self.across += int((off_deg > ACROSS_DEG).sum())
         self.off_motion_deg.append(off_deg)
+
+    def _count_jumps_over_junctions(self, vehicle: IntArray, xy_m: FloatArray) -> None:
+        """Count steps from one side of a junction to the other; rows are by vehicle, then time."""
+        if self._lanes is None:
+            return
+        step_m = np.diff(xy_m, axis=0)
+        length_m = np.hypot(*step_m.T)
+        start = np.flatnonzero((np.diff(vehicle) == 0) & (length_m > 0.0))[:_MAX_STEPS]
+        self.inside_junctions += int(self._lanes.in_junctions(xy_m[start]).sum())
+        start = start[(length_m[start] >= MIN_JUMP_OVER_M) & (length_m[start] <= AROUND_M)]
+        between = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        points_m = xy_m[start, None] + between[:, None] * step_m[start, None]
+        inside = self._lanes.in_junctions(points_m.reshape(-1, 2)).reshape(-1, _SAMPLES)
+        self.jumps_over_junctions += int((inside.mean(axis=1) * length_m[start] >= MIN_JUMP_OVER_M).sum())
 
     def _add_top_speeds(self, vehicle: IntArray, time_s: FloatArray, xy_m: FloatArray) -> None:
         """Measure how fast each vehicle is on its fastest stretch; rows are by vehicle, then time."""
@@ -280,7 +308,10 @@ class RoadCheck:
         where
             Key of the file, for messages.
         """
-        yield from self.names.findings(where)
+        jumps = list(self._junction_findings(where))
+        yield from jumps
+        if not jumps or self.names.repeated:
+            yield from self.names.findings(where)
         headings = list(self._heading_findings(where))
         yield from headings
         if not any(finding.is_error for finding in headings):
@@ -288,6 +319,17 @@ class RoadCheck:
         yield from self._speed_findings(where)
         yield from self._clock_findings(where)
         yield from self._position_findings(where)
+
+    def _junction_findings(self, where: str) -> Iterator[Diagnostic]:
+        jumps = self.jumps_over_junctions
+        if jumps < MIN_POSITIONS or self.inside_junctions > MAX_INSIDE_SHARE * jumps:
+            return
+        problem = (
+            f"vehicles jump over junctions in {number_of(jumps, 'step')}, and are inside them in"
+            f" {number_of(self.inside_junctions, 'row')}: the network that SUMO used had no internal links"
+        )
+        hint = "Simulate again with a network that has them: run netconvert with --no-internal-links false."
+        yield Diagnostic("jumps over junctions", where, problem, hint)
 
     def _heading_findings(self, where: str) -> Iterator[Diagnostic]:
         if not self.headings:

@@ -68,7 +68,31 @@ _HUGE_PAGES = "glibc.malloc.hugetlb=1"
 
 
 class SumoInputError(RunError):
-    """A program of SUMO rejected its input: it ended with an error, crashed, or exceeded a limit."""
+    """A program of SUMO rejected its input: it ended with an error, crashed, or exceeded a limit.
+
+    Attributes
+    ----------
+    limit
+        The limit that was exceeded, which says nothing against the input; None for other reasons.
+    """
+
+    limit: limits.Limit | None = None
+
+    def for_input(self, where: object, problem: str, hint: str) -> InputError:
+        """Return this error for a file of the user.
+
+        Parameters
+        ----------
+        where
+            The file.
+        problem
+            What failed, in words.
+        hint
+            What to do about the file; left out where a limit was exceeded.
+        """
+        if self.limit is not None:
+            return InputError(where, f"{problem}: {str(self).removesuffix(f'. {self.limit.hint}')}", self.limit.hint)
+        return InputError(where, f"{problem}: {str(self).rstrip(':.')}", hint)
 
 
 @dataclass(frozen=True)
@@ -390,8 +414,10 @@ def program_error(name: str, code: int, text: str, allowance: Allowance) -> RunE
 
 
 def _limit_error(problem: str, limit: limits.Limit) -> SumoInputError:
-    """Return the error for an exceeded limit, without a period: the message of an InputError goes on after it."""
-    return SumoInputError(f"{problem}. {limit.hint.removesuffix('.')}")
+    """Return the error for an exceeded limit."""
+    error = SumoInputError(f"{problem}. {limit.hint}")
+    error.limit = limit
+    return error
 
 
 @contextmanager

@@ -531,6 +531,6 @@ def _convert_osm_once(path: Path, _content: str) -> bytes:
         try:
             sumo.run_netconvert(["--osm-files", MAP_FILE, *_OSM_FLAGS], folder, NETWORK_FILE)
         except sumo.SumoInputError as error:
-            problem = f"no network can be built from this map: {error}"
-            raise InputError(path, problem, "Download the map again, in full.") from None
+            problem = "no network can be built from this map"
+            raise error.for_input(path, problem, "Download the map again, in full.") from None
         return (folder / NETWORK_FILE).read_bytes()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import zipfile
 from collections.abc import Mapping
 from itertools import combinations
 from pathlib import Path
@@ -188,6 +189,15 @@ def test_same_map_gives_same_bytes(made: creation.NewCity, extract: Path, tmp_pa
     assert contents(again.folder) == contents(made.folder)
 
 
+@pytest.mark.system
+def test_city_of_a_zipped_map(made: creation.NewCity, extract: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "town.zip", "w") as archive:
+        archive.write(extract, "town/map.osm")
+    again = creation.create_city(tmp_path / "town", tmp_path / "town.zip")
+    assert contents(again.folder) == contents(made.folder)
+    assert not any(str(tmp_path) in note and "town.zip" not in note for note in again.notes)
+
+
 def test_leaves_out_junction_without_pole_locations(extract: Path, tmp_path: Path) -> None:
     city = creation.create_city(tmp_path / "town", extract, NewCityOptions(which="all"))
     assert [new.junction.names[0] for new in city.junctions] == ["A Road", "B Road"]
@@ -247,7 +257,7 @@ def test_wrong_input_gives_one_message_and_creates_nothing(extract: Path, tmp_pa
         (["--around", "here"], "--around: expected LAT,LON in degrees, got 'here'"),
         (
             ["--junctions", "signalized"],
-            "signalized: no such file. Give a CSV table of junctions",
+            "signalized: no such file. Give a table of junctions",
         ),
         (["--around", "50.0,10.0", "--radius", "90"], "too near to the rim"),
         (["--traffic", "dense"], "--traffic: expected light, medium or heavy, got 'dense'"),

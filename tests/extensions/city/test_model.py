@@ -59,8 +59,8 @@ def test_reads_table_as_written(tmp_path: Path) -> None:
         ([ROW.replace("50.1", "91")], "line 2 (j1): lat_deg: expected a number from -90 to 90, got '91'"),
         ([ROW.replace("9.2", "east")], "line 2 (j1): lon_deg: expected a number from -180 to 180, got 'east'"),
         ([ROW.replace("true", "yes")], "line 2 (j1): signalised: expected true or false, got 'yes'"),
-        ([ROW + ",more"], "line 2: expected 8 values, got"),
-        (["j1,A"], "line 2: expected 8 values, got"),
+        ([ROW + ",more"], "line 2: expected 7 values, got"),
+        (["j1,A"], "line 2: expected 7 values, got"),
     ],
 )
 def test_rejects_wrong_row(tmp_path: Path, rows: list[str], message: str) -> None:

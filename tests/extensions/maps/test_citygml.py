@@ -95,7 +95,7 @@ def test_objects_outside_the_window_are_left_out(tmp_path: Path) -> None:
     result = citygml.read_solids([path], CONTEXT)
     assert [mesh.name for mesh in result.meshes] == ["near"]
     assert result.counts.dropped == {"out_of_range": {"building": 1}}
-    for east_m, distance in ((1300, "1000 m"), (335, "35 m")):
+    for east_m, distance in ((1300, "1000 m"), (335, "35 m"), (250_000, "more than 100 km")):
         path = write_model(tmp_path / "b.gml", house("far", east_m, 0))
         (note,) = citygml.read_solids([path], CONTEXT).notes
         assert (

@@ -329,6 +329,15 @@ def test_speed_limits(tmp_path: Path) -> None:
         build(crossing.writer.write(tmp_path / "map.osm"))
 
 
+def test_assumed_classes_are_counted_once(tmp_path: Path) -> None:
+    """The roads of a map with a ring are converted twice."""
+    path = ROOT / "scenarios" / "roundabout" / "network.net.xml"
+    written = write_network(read_net_xml(path), path.read_text(encoding="utf-8"))
+    built = build(written.writer.write(tmp_path / "map.osm", local=True))
+    counts = re.findall(r" for (\d+) road", built.note("Road classes"))
+    assert sum(map(int, counts)) == len(built.network.edges)
+
+
 def test_permissions(tmp_path: Path) -> None:
     crossing = make_crossing()
     crossing.writer.lanelets[crossing.into[0]][2]["subtype"] = "bus_lane"

@@ -437,6 +437,21 @@ def test_rejects_broken_maps(
 
 
 @pytest.mark.system
+def test_speed_limits_of_roads_and_lanes(tmp_path: Path) -> None:
+    """Road 1 has 25 mph, and 30 km/h from 60 m on; road 2 has none but that of its lane -1."""
+    speed = '<type s="0" type="town"><speed max="50" unit="km/h"/></type>'
+    first, second = maps.two_roads()
+    changing = (speed + speed.replace('"0"', '"60"', 1)).replace('max="50" unit="km/h"', 'max="25" unit="mph"', 1)
+    first = first.replace(speed, changing.replace("50", "30"))
+    own = '<speed sOffset="0" max="10" unit="m/s"/></lane></right>'
+    second = second.replace(speed, "").replace("</lane></right>", own)
+    road_map, roads = convert(tmp_path, maps.opendrive(first, second))
+    speeds = sorted({(edge.from_node, edge.id): round(edge.lanes[0].speed_m_s, 1) for edge in roads.edges}.values())
+    assert speeds == [8.3, 8.3, 10.0, 11.2, 11.2, 13.9]
+    assert "1 of 2 roads has no speed limit: 50 km/h assumed, 2." in road_map.notes
+
+
+@pytest.mark.system
 @pytest.mark.slow
 def test_town01_keeps_all_lanes_and_turns(tmp_path: Path) -> None:
     """Road 1 is 157.54 m long, between the junctions 43 and 26; it leads to road 25 by a turn in junction 26."""
@@ -484,6 +499,68 @@ def test_spirals_that_are_hardly_bent(tmp_path: Path, curvature: float, change: 
     else:
         offset_m = shape[:, 1] + 1.75
     assert np.abs(offset_m).max() < 0.02
+
+
+@pytest.mark.system
+def test_borders_of_lanes_are_read_as_widths(tmp_path: Path) -> None:
+    """The outer lane is 3 m wide, and 4 m from s = 50 m on; netconvert alone takes its own width for both."""
+    inner, outer = (lane(number, width="0 0 0 0").replace("<width", "<border") for number in (-1, -2))
+    outer = outer.replace("/></lane>", '/><border sOffset="50" a="-7.5" b="0" c="0" d="0"/></lane>')
+    both = inner.replace('a="0"', 'a="-3.5"') + outer.replace('a="0"', 'a="-6.5"')
+    road_map, roads = convert(
+        tmp_path, maps.opendrive(maps.road("1", 100, maps.geometry(0, 0, 0, 100), section([both])))
+    )
+    assert "2 of 2 lanes for vehicles" in road_map.notes[0]
+    assert lanes(roads)["-1_1"].width_m == pytest.approx(3.5)
+    assert 3 <= lanes(roads)["-1_0"].width_m <= 4
+
+
+@pytest.mark.system
+def test_virtual_junction_is_named_and_moves_no_road(tmp_path: Path) -> None:
+    """Road 31 leaves road 1 at s = 20 m; netconvert alone would let road 1 end there."""
+    one = section([lane(-1, link="predecessor -1, successor -1")])
+    branch = maps.road("31", 20, maps.geometry(20, 0, -0.5, 20), one, "predecessor road 1, successor road 32 start",
+                       junction="9")  # fmt: skip
+    drive = maps.road(
+        "32", 50, maps.geometry(38, -9, -1, 50), section([lane(-1)], [lane(1)]), "predecessor road 31 end"
+    )
+    virtual = maps.junction("9", ("1", "31", "start", "-1:-1")).replace("name", 'type="virtual" mainRoad="1" name')
+    road_map, roads = convert(tmp_path, maps.opendrive(*maps.two_roads(), branch, drive, virtual))
+    assert "1 virtual junction, which joins roads between their ends, and the roads through it are left out: 31." in (
+        road_map.notes
+    )
+    assert lanes(roads)["-1_0"].length_m == pytest.approx(100, abs=0.1)
+    assert {(source, target) for source, _, target, _ in turns(roads)} == {("-1", "-2"), ("2", "1")}
+
+
+@pytest.mark.system
+def test_turn_through_two_junctions_without_a_road_between_is_named(tmp_path: Path) -> None:
+    """Road 1 leads to road 2 by road 11 in junction 8 and road 21 in junction 9; netconvert sees no road between."""
+    one = section([lane(-1, link="predecessor -1, successor -1")])
+    road_map, _ = convert(tmp_path, maps.opendrive(
+        road("1", 100, geometry(0, 0, 0, 100), section([lane(-1)]), "successor junction 8"),
+        road("11", 20, geometry(100, 0, 0, 20), one, "predecessor road 1 end, successor junction 9", junction="8"),
+        road("21", 20, geometry(120, 0, 0, 20), one, "predecessor junction 8, successor road 2 start", junction="9"),
+        road("2", 100, geometry(140, 0, 0, 100), section([lane(-1)]), "predecessor junction 9"),
+        maps.junction("8", ("1", "11", "start", "-1:-1")), maps.junction("9", ("11", "21", "start", "-1:-1")),
+    ))  # fmt: skip
+    notes = " ".join(road_map.notes)
+    assert "of 1 turns of the map" in notes
+    assert ("0 of 1 turns" in notes) == ("Turns between these roads are missing: 1 to 2." in notes)
+
+
+@pytest.mark.system
+def test_limit_of_netconvert_says_nothing_against_the_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise sumo.program_error("netconvert", 1, "Error: std::bad_alloc", sumo.Allowance(300, 1))
+
+    monkeypatch.setattr(sumo, "run_netconvert", fail)
+    with pytest.raises(InputError) as error:
+        convert(tmp_path, maps.merge())
+    assert str(error.value).endswith(
+        "map.xodr: netconvert cannot use the map: netconvert needed more than 300 MB of memory. The limit is 2,000 MB;"
+        " set EGVS_MAX_SUMO_MB to raise it."
+    )
 
 
 @pytest.mark.system

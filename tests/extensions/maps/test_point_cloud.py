@@ -195,6 +195,23 @@ def test_las_file_in_another_reference_system(tmp_path: Path) -> None:
 
 
 @needs_laspy
+def test_two_reference_systems_that_disagree_are_named(tmp_path: Path) -> None:
+    from pyproj import CRS
+
+    from tests.formats.test_las_header import UTM_15, write_las
+
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(0, 20, 0.5), np.arange(0, 20, 0.5)))
+    points = np.column_stack([x + 500_000, y + 4_600_000, np.full(x.size, 3.0)])
+    context = MapContext(WorldFrame("EPSG:32615", (-500_000.0, -4_600_000.0)), box(-50, -50, 50, 50))
+    for code, said in (("EPSG:32615+6360", "heights in the unit US survey foot instead of metre."),
+                       ("EPSG:32616", "positions 498 km away."), ("EPSG:32615", "")):  # fmt: skip
+        path = write_las(tmp_path / "a.las", UTM_15, CRS(code).to_wkt("WKT1_GDAL"), points=points)
+        found = [note for note in point_cloud.read_solids([path], context).notes if "disagree" in note]
+        assert len(found) == bool(said)
+        assert all(note.startswith(f"{path} declares two") and note.endswith(said) for note in found)
+
+
+@needs_laspy
 def test_heights_in_feet_and_points_marked_as_noise(tmp_path: Path) -> None:
     """A plane 300 m high in US survey feet, and a cloud of noise above it, in UTM 15 north by GeoTIFF keys."""
     from tests.formats.test_las_header import SURVEY_FOOT_M, UTM_15, write_las

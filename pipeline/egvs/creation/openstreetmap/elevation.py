@@ -27,6 +27,9 @@ ELEVATION_FLAGS = ("--osm.elevation", "--geometry.max-grade.fix", "false")
 MIN_SHARE = 0.8
 """Share of road nodes that need a height."""
 
+NOTED_SHARE = 0.01
+"""Fewer heights than this share of the road nodes are ignored without a note."""
+
 _KEY = "ele"
 _MAX_M = 9000.0
 
@@ -64,6 +67,8 @@ def read_elevations(extract: OsmExtract) -> RoadElevations:
     if count < MIN_SHARE * total:
         note = (
             f"The heights (ele) of {count:,} of {number_of(total, 'road node')} are ignored, since too many have none."
+            if count >= NOTED_SHARE * total
+            else ""
         )
         return RoadElevations({}, count, total, note)
 

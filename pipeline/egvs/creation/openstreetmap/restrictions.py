@@ -79,23 +79,35 @@ class Restrictions:
         Relations that hold for certain vehicles, but not for cars.
     with_exceptions
         Relations in force for cars that except other motor vehicles.
+    without_turn
+        Relations whose streets are in the map, but do not meet at a node or way with the role ``via``.
     """
 
     in_force: tuple[Restriction, ...] = ()
     conditional: tuple[int, ...] = ()
     by_vehicle: tuple[int, ...] = ()
     with_exceptions: tuple[int, ...] = ()
+    without_turn: tuple[int, ...] = ()
+
+
+def is_restriction(relation: Relation) -> bool:
+    """Return whether a relation is a turn restriction; in an old form, the type names the vehicle."""
+    return (relation.tags.get("type") or "").partition(":")[0] == "restriction"
 
 
 def read_restrictions(extract: OsmExtract) -> Restrictions:
     """Return the turn restrictions of an extract; those whose members are not in it are left out."""
     in_force: list[Restriction] = []
-    conditional, by_vehicle, with_exceptions = [], [], []
-    for relation in extract.relations:
-        if relation.tags.get("type") != "restriction":
+    conditional, by_vehicle, with_exceptions, without_turn = [], [], [], []
+    for relation in map(_in_present_form, filter(is_restriction, extract.relations)):
+        if not (relation.ways("from") and relation.ways("to")):
+            without_turn.append(relation.id)
             continue
         restriction = _parse(relation, extract)
         if restriction is None:
+            continue
+        if not _has_turn(restriction, extract):
+            without_turn.append(relation.id)
             continue
         kind = _kind_for_cars(relation.tags)
         if kind and not any(key in relation.tags for key in _OLD_TIMES):
@@ -106,7 +118,17 @@ def read_restrictions(extract: OsmExtract) -> Restrictions:
             conditional.append(relation.id)
         elif _kinds(relation.tags):
             by_vehicle.append(relation.id)
-    return Restrictions(tuple(in_force), tuple(conditional), tuple(by_vehicle), tuple(with_exceptions))
+    others = map(tuple, (conditional, by_vehicle, with_exceptions, without_turn))
+    return Restrictions(tuple(in_force), *others)
+
+
+def _in_present_form(relation: Relation) -> Relation:
+    """Return a restriction with the vehicle in the key ``restriction:motorcar`` instead of the type."""
+    _, _, vehicle = relation.tags["type"].partition(":")
+    if not vehicle:
+        return relation
+    renamed = {f"{key}:{vehicle}" if key == "restriction" else key: value for key, value in relation.tags.items()}
+    return replace(relation, tags=renamed)
 
 
 def _parse(relation: Relation, extract: OsmExtract) -> Restriction | None:
@@ -114,11 +136,23 @@ def _parse(relation: Relation, extract: OsmExtract) -> Restriction | None:
     targets = frozenset(way for way in relation.ways("to") if way in extract.ways)
     nodes = frozenset(member.id for member in relation.members if member.type == "node" and member.role == "via")
     via_ways = tuple(relation.ways("via"))
-    is_complete = sources and targets and all(way in extract.ways for way in via_ways)
-    if not is_complete or not (nodes or via_ways):
+    if not (sources and targets and all(way in extract.ways for way in via_ways)):
         return None
     via_ways = _in_order(via_ways, sources, extract)
     return Restriction(relation.id, False, sources, targets, frozenset() if via_ways else nodes, via_ways)
+
+
+def _has_turn(restriction: Restriction, extract: OsmExtract) -> bool:
+    """Return whether the streets of a restriction meet where it says; a node outside the map counts as a meeting."""
+    ends = [
+        {node for way in ways for node in extract.ways[way].nodes}
+        for ways in (restriction.sources, restriction.targets)
+    ]
+    if restriction.via_ways:
+        first, last = (extract.ways[restriction.via_ways[index]].nodes for index in (0, -1))
+        return bool(ends[0] & {*first} and ends[1] & {*last})
+    outside = restriction.via_nodes - extract.nodes.keys()
+    return bool(outside or restriction.via_nodes & ends[0] & ends[1])
 
 
 def _in_order(via_ways: Sequence[int], sources: Collection[int], extract: OsmExtract) -> tuple[int, ...]:
@@ -154,7 +188,8 @@ def _excepted(tags: Tags) -> set[str]:
 
 
 def _is_kind(value: str) -> bool:
-    return value.startswith(("no_", "only_"))
+    """Return whether a value forbids turns; ``no_right_turn_on_red`` forbids them at red only."""
+    return value.startswith(("no_", "only_")) and not value.endswith("_on_red")
 
 
 def restrictions_of_pieces(
@@ -171,10 +206,7 @@ def restrictions_of_pieces(
     ways
         The ways before they were cut.
     """
-    return tuple(
-        _of_pieces(relation, cut, ways) if relation.tags.get("type") == "restriction" else relation
-        for relation in relations
-    )
+    return tuple(_of_pieces(relation, cut, ways) if is_restriction(relation) else relation for relation in relations)
 
 
 def _of_pieces(relation: Relation, cut: Mapping[int, Collection[Way]], ways: Mapping[int, Way]) -> Relation:

@@ -81,9 +81,11 @@ def map_solids(
     counts = ImportCounts()
     lanes = shapely.STRtree(list(streets.areas.values()))
 
-    objects = [find(extract, xy, counts) for find in (find_buildings, find_barriers, find_poles)]
+    objects = [find(extract, xy, counts) for find in (find_barriers, find_poles)]
     solids: list[MappedSolid] = []
-    for solid in itertools.chain(*objects, make_decks(bridges, xy, counts)):
+    for solid in itertools.chain(
+        find_buildings(extract, xy, counts, window), *objects, make_decks(bridges, xy, counts)
+    ):
         if _is_outside(solid, window):
             counts.drop(solid.kind, OUT_OF_RANGE)
             continue
@@ -163,7 +165,9 @@ def way_area(way: Way, xy: dict[int, XY], counts: ImportCounts) -> BaseGeometry:
     return shapely.union_all(areas)
 
 
-def find_buildings(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
+def find_buildings(
+    extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts, window: BaseGeometry | None = None
+) -> Iterator[MappedSolid]:
     """Yield building outlines and parts; an outline is used only where it has no parts.
 
     Parameters
@@ -174,15 +178,18 @@ def find_buildings(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts)
         x, y in metres by node.
     counts
         Counts what happens to the objects.
+    window
+        What is left out is counted within it; None for everywhere.
     """
-    for tags in extract.node_tags.values():
-        if _is_building(tags):
+    for node, tags in extract.node_tags.items():
+        if _is_building(tags) and (window is None or window.intersects(Point(xy[node]))):
             counts.drop("building", "no_outline")
 
     footprints = list(_footprints(extract, xy, counts))
     part_areas = [area for _, tags, area in footprints if not _is_outline(tags)]
     parts_tree = shapely.STRtree(part_areas)
-    for name, tags, area in footprints:
+    for name, tags, outline in footprints:
+        area = outline
         parts: list[BaseGeometry] = []
         if _is_outline(tags):
             parts = [part_areas[i] for i in parts_tree.query(area, predicate="intersects")]
@@ -193,7 +200,7 @@ def find_buildings(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts)
         counts.slivers += slivers
         if pieces:
             yield _make_building(name, tags, pieces, counts)
-        else:
+        elif window is None or window.intersects(outline):
             counts.drop("building", "covered_by_parts" if parts else "degenerate")
 
 

@@ -29,7 +29,7 @@ from egvs.core.grid import XY
 from egvs.creation import junctions
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.creation.openstreetmap import ATTRIBUTION, street_turns
-from egvs.creation.openstreetmap.restrictions import restrictions_of_pieces
+from egvs.creation.openstreetmap.restrictions import is_restriction, restrictions_of_pieces
 from egvs.creation.plain_network import NETWORK_FILE
 from egvs.formats import xml
 from egvs.formats.osm import OsmExtract, Way, parse_number
@@ -115,7 +115,7 @@ class StreetNetwork(NamedTuple):
     streets
         The same network, read.
     notes
-        Sentences for the user about its turns.
+        Sentences for the user about its turns, and what the map does not state.
     """
 
     text: str
@@ -175,8 +175,7 @@ def build_network(
             if _NOTHING_LOADED.search(str(error)):
                 raise no_streets from None
             if isinstance(error, sumo.SumoInputError):
-                problem = f"netconvert cannot use the streets: {error}"
-                raise InputError(osm, problem, "Choose another extract.") from None
+                raise error.for_input(osm, "netconvert cannot use the streets", "Choose another extract.") from None
             raise
         text = (folder / NETWORK_FILE).read_text(encoding="utf-8")
 
@@ -460,9 +459,10 @@ def _write_streets(extract: OsmExtract, xml: Path) -> None:
             writer.add_node(mutable.Node(id=node, location=(lon_deg, lat_deg), tags=tags))
         for way in streets:
             nodes = [n for n in way.nodes if n in extract.nodes]
-            writer.add_way(mutable.Way(id=way.id, nodes=nodes, tags=sorted(way.tags.items())))
+            name = {"name": way.tags["ref"]} if "ref" in way.tags else {}  # the only name of many main roads
+            writer.add_way(mutable.Way(id=way.id, nodes=nodes, tags=sorted((name | way.tags).items())))
         for relation in extract.relations:
-            if relation.tags.get("type") == "restriction":
+            if is_restriction(relation):
                 members = [(member.type[0], member.id, member.role) for member in relation.members]
                 tags = sorted(relation.tags.items())
                 writer.add_relation(mutable.Relation(id=relation.id, members=members, tags=tags))

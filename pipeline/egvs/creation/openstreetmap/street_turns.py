@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -40,7 +40,7 @@ from egvs.creation.turns import (
 )
 from egvs.formats import xml
 from egvs.formats.osm import OsmExtract, Tags, Way
-from egvs.traffic.network import CAR, Permission
+from egvs.traffic.network import CAR, Permission, is_carriageway
 
 ORIGINAL_NAMES_FLAG = "--output.original-names"
 """Lets netconvert note the ways and nodes of the map that its edges come from."""
@@ -69,6 +69,8 @@ _FOR_CARS = frozenset({
 _FOR_VEHICLES = _FOR_CARS | {"busway", "bus_guideway", "track", "raceway", "services"}
 """Values of ``highway``."""
 
+_LANE_KEYS = ("lanes", "lanes:forward", "lanes:backward")
+_SPEED_KEYS = ("maxspeed", "maxspeed:forward", "maxspeed:backward")
 _CAR_KEYS = ("motorcar", "motor_vehicle", "vehicle", "access")
 _NO_ACCESS = ("no", "private", "agricultural", "forestry", "military")
 _BUS_KEYS = ("bus", "psv")
@@ -126,6 +128,10 @@ class StreetEdge:
         The pieces of ways, in driving direction.
     car_lanes
         Indices of the lanes for cars.
+    lanes
+        Number of lanes, without pavements.
+    speed_m_s
+        Speed limit.
     """
 
     id: str
@@ -133,6 +139,8 @@ class StreetEdge:
     to_node: str
     steps: tuple[Step, ...]
     car_lanes: tuple[int, ...]
+    lanes: int
+    speed_m_s: float
 
 
 @dataclass(frozen=True)
@@ -203,8 +211,9 @@ class StreetGraph:
         return not restriction.only or any(self._is_in_network(way) for way in restriction.targets)
 
     def _is_in_network(self, way: int) -> bool:
-        """Return whether a way is on edges, or inside a junction between them."""
-        return way in self._ways and bool(self._nodes & {*self._ways[way].nodes})
+        """Return whether a way for vehicles is on edges, or inside a junction between them."""
+        found = self._ways.get(way)
+        return found is not None and found.tags["highway"] in _FOR_VEHICLES and bool(self._nodes & {*found.nodes})
 
     def _add_edge(self, element: Element) -> None:
         edge_id = element.attrib["id"]
@@ -215,16 +224,17 @@ class StreetGraph:
             if param.get("key") == "origId"
             for name in param.get("value", "").split()
         }
-        lanes = [
-            int(lane.attrib["index"])
-            for lane in element.iter("lane")
-            if Permission.from_attributes(lane.attrib).admits(CAR)
-        ]
+        permissions = {
+            int(lane.attrib["index"]): Permission.from_attributes(lane.attrib) for lane in element.iter("lane")
+        }
+        car_lanes = tuple(index for index, permission in permissions.items() if permission.admits(CAR))
+        lanes = sum(map(is_carriageway, permissions.values()))
+        speed_m_s = max((float(lane.attrib["speed"]) for lane in element.iter("lane")), default=0.0)
         start, end = params.get("origFrom", element.get("from", "")), params.get("origTo", element.get("to", ""))
         steps = self._steps(edge_id, start, end, {int(name) for name in names if _INTEGER.fullmatch(name)})
         if steps:
             nodes = element.get("from", ""), element.get("to", "")
-            self.edges[edge_id] = StreetEdge(edge_id, *nodes, steps, tuple(lanes))
+            self.edges[edge_id] = StreetEdge(edge_id, *nodes, steps, car_lanes, lanes, speed_m_s)
         else:
             self.unknown.append(edge_id)
 
@@ -405,9 +415,16 @@ class StreetGraph:
         return f"{text} (relation {list_first([str(r) for r in sorted(relations)], 3)})" if relations else text
 
     def is_in_network(self, relation: int) -> bool:
-        """Return whether both ends of a restriction are streets of the network."""
+        """Return whether both ends of a restriction are streets of the network, or the one that it names."""
         members = next(r for r in self._extract.relations if r.id == relation)
-        return all(any(map(self._is_in_network, members.ways(role))) for role in ("from", "to"))
+        ends = [ways for ways in map(members.ways, ("from", "to")) if ways]
+        return bool(ends) and all(any(map(self._is_in_network, ways)) for ways in ends)
+
+    def edges_without(self, keys: Collection[str]) -> Iterator[StreetEdge]:
+        """Yield the edges of which a part has none of some tags."""
+        for edge in self.edges.values():
+            if any(self._ways[step.way].tags.keys().isdisjoint(keys) for step in edge.steps):
+                yield edge
 
     def beyond_junctions(self) -> tuple[int, ...]:
         """Return the restrictions over ways that are edges of their own: no connection can express them."""
@@ -586,17 +603,33 @@ def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
     if count := len(after.turns_back):
         turns = list_turns(graph.title(pair) for pair in after.turns_back)
         yield (
-            f"{number_of(count, 'U-turn')} (more than {U_TURN_DEG:g} degrees) {by_number(count, 'is', 'are')} left out,"
-            f" since vehicles that wait to turn back block a street: {turns}."
+            f"{number_of(count, 'U-turn')} {by_number(count, 'is', 'are')} left out, since vehicles that wait to turn"
+            f" back block a street: {turns}."
         )
     if count := len(after.off_arrows):
         turns = list_turns(graph.title((lane.source, lane.target)) for lane in after.off_arrows)
         subject = f"{number_of(count, 'connection')} of lanes {by_number(count, 'does', 'do')}"
         yield f"{subject} not follow the arrows of the map (turn:lanes): {turns}."
     yield from _restriction_notes(graph)
+    yield from _assumption_notes(graph)
     if graph.unknown:
         edges = list_first(graph.unknown, MOST_LISTED)
         yield f"The turns of {number_of(len(graph.unknown), 'edge')} could not be compared with the map: {edges}."
+
+
+def _assumption_notes(graph: StreetGraph) -> Iterator[str]:
+    """Yield sentences on the lanes and speed limits that are netconvert's defaults."""
+    lanes = Counter(edge.lanes for edge in graph.edges_without(_LANE_KEYS))
+    if lanes:
+        yield f"Numbers of lanes that the map does not state are assumed by road class: {_edge_counts(lanes)}."
+    speeds_km_h = Counter(round(edge.speed_m_s * 3.6) for edge in graph.edges_without(_SPEED_KEYS))
+    if speeds_km_h:
+        counts = _edge_counts(speeds_km_h, " km/h")
+        yield f"Speed limits that the map does not state are assumed by road class: {counts}."
+
+
+def _edge_counts(values: Counter[int], unit: str = "") -> str:
+    return ", ".join(f"{value}{unit} for {number_of(values[value], 'edge')}" for value in sorted(values))
 
 
 def _restriction_notes(graph: StreetGraph) -> Iterator[str]:
@@ -611,6 +644,10 @@ def _restriction_notes(graph: StreetGraph) -> Iterator[str]:
         in_network = [str(relation) for relation in relations if graph.is_in_network(relation)]
         if in_network:
             yield f"Turn restrictions that hold {what}: {_count(in_network)}."
+    without_turn = [str(relation) for relation in restrictions.without_turn if graph.is_in_network(relation)]
+    if without_turn:
+        what = "whose streets do not meet at their via, and which are left out"
+        yield f"Turn restrictions {what}: {_count(without_turn)}."
     if beyond := graph.beyond_junctions():
         yield (
             "Turn restrictions that lead over a street between two junctions, which SUMO cannot express; the turns stay"

@@ -57,7 +57,10 @@ def new(
     osm: Annotated[
         Path,
         typer.Option(
-            "--from", "--osm", metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped)."
+            "--from",
+            "--osm",
+            metavar="FILE",
+            help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped or zipped).",
         ),
     ],
     around: Annotated[

@@ -36,6 +36,7 @@ from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, T
 from egvs.creation.driving_side import requested_left
 from egvs.creation.junctions import HEIGHTS_M, JunctionRegion, KerbsidePole, NearbyJunction, StreetJunction, Streets
 from egvs.creation.map_parts import ImportCounts, MappedSolid
+from egvs.creation.map_readers import open_maps
 from egvs.creation.openstreetmap import ATTRIBUTION
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
@@ -47,6 +48,7 @@ from egvs.extensions.city import model
 from egvs.extensions.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC_FOLDER, CityJunction
 from egvs.extensions.city.network_excerpts import NetworkExcerpts
 from egvs.extensions.city.town_flow import FlowCapacity, find_flow
+from egvs.formats.archives import unpack_archives
 from egvs.formats.osm import read_osm as read_extract
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
@@ -215,7 +217,7 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     folder
         Created by this function; may exist if it is empty.
     osm
-        An OpenStreetMap file: XML (plain or gzipped) or PBF.
+        An OpenStreetMap file: XML (plain or gzipped) or PBF; or a folder or ZIP archive with one.
     options
         Options; the defaults when None.
 
@@ -226,7 +228,14 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
         the side of traffic is unclear, a table is wrong or selects junctions with overlapping regions, or no junction
         is left. Nothing is written then.
     """
-    options = options or NewCityOptions()
+    with unpack_archives([osm]) as unpacked:
+        (path,) = unpacked.paths
+        return _create_city(
+            folder, open_maps([path]).roads.path if path.is_dir() else path, options or NewCityOptions()
+        )
+
+
+def _create_city(folder: Path, osm: Path, options: NewCityOptions) -> NewCity:
     around, radius_m, which = options.around, options.radius_m, options.which
     assumed_traffic.check_traffic_level(options.traffic)
     side_option = requested_left(lefthand=options.lefthand, righthand=options.righthand)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from egvs.core.readers import Reader, with_gzip
 
 _CITYJSON = rb'"type"\s*:\s*"CityJSON"'
+_JSON_OBJECT = rb"\A(?:\xef\xbb\xbf)?\s*\{"
 _CITY_MODEL = rb"<(?:[\w.-]+:)?CityModel[\s>]"
 
 READERS = (
@@ -35,6 +36,7 @@ READERS = (
         "map",
         "egvs.extensions.maps.buildings.cityjson",
         suffixes=(".json",),
+        head=_JSON_OBJECT,
         content=_CITYJSON,
         gives=("solids",),
     ),
@@ -50,6 +52,7 @@ READERS = (
         "map",
         "egvs.extensions.maps.buildings.footprint_maps",
         suffixes=(".json",),
+        head=_JSON_OBJECT,
         content=rb'"FeatureCollection"',
         gives=("solids",),
     ),

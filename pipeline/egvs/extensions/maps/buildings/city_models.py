@@ -64,6 +64,8 @@ _EARTH_AXIS_M, _EARTH_ECCENTRICITY_2 = 6_378_137.0, 0.006_694_380_022_90
 
 _FLAT_NORMAL = 0.7
 _MAX_NAMES = 10
+_FAR_M = 100_000
+"""Greater distances in the world frame are not exact."""
 _MAX_CHECKED = 1000
 
 Rings = list[list[FloatArray]]
@@ -331,9 +333,12 @@ class _OutsideObjects:
             problem = f"no object is within reach of the roads; in the order {order}, {swapped:,} would be"
             hint = f"Correct the order of the coordinates, or name a system whose axes are {order}."
             raise InputError(self._where, problem, hint)
+        distance = format_distance(math.ceil(self._nearest_m))
+        if self._nearest_m > _FAR_M:
+            distance = f"more than {format_distance(_FAR_M)}"
         yield (
             f"{Path(self._where).name}: none of its {number_of(self._outside, 'object')} is within reach of the"
-            f" sensors; the nearest is {format_distance(math.ceil(self._nearest_m))} beyond it."
+            f" sensors; the nearest is {distance} beyond it."
         )
 
     def _is_inside_swapped(self, point: FloatArray, system: ReferenceSystem) -> bool:

@@ -23,7 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
@@ -234,6 +234,8 @@ class Road:
         Lane sections, sorted.
     signals
         Signals and signs.
+    states_speed
+        Whether the road, or each of its lanes for driving, has a speed limit.
     """
 
     id: str
@@ -249,6 +251,7 @@ class Road:
     lane_offsets: tuple[Cubic, ...]
     sections: tuple[LaneSection, ...]
     signals: tuple[RoadSignal, ...]
+    states_speed: bool = False
 
     def is_light_elsewhere(self, signal: RoadSignal) -> bool:
         """Return whether a signal is a traffic light for traffic towards an end that is at no junction."""
@@ -323,6 +326,8 @@ class OpenDriveMap:
         By id.
     junctions
         The connections of each junction, by id.
+    virtual
+        Ids of virtual junctions, which join roads between their ends.
     """
 
     reference: str
@@ -330,6 +335,11 @@ class OpenDriveMap:
     offset_rad: float
     roads: Mapping[str, Road]
     junctions: Mapping[str, tuple[JunctionConnection, ...]]
+    virtual: frozenset[str] = frozenset()
+
+    def is_in_virtual_junction(self, road: str) -> bool:
+        """Return whether a road leads through a virtual junction."""
+        return road in self.roads and self.roads[road].junction in self.virtual
 
 
 def evaluate(cubics: Sequence[Cubic], s_m: FloatArray) -> FloatArray:
@@ -360,6 +370,7 @@ def read_opendrive(path: Path) -> OpenDriveMap:
     header: Element | None = None
     roads: dict[str, Road] = {}
     junctions: dict[str, tuple[JunctionConnection, ...]] = {}
+    virtual = set()
     for element in xml.iter_elements(path, "", on_root=lambda root: _check_root(root, path)):
         _strip_namespaces(element)
         name = f"<{element.tag} id={element.get('id', '')!r}>"
@@ -375,6 +386,8 @@ def read_opendrive(path: Path) -> OpenDriveMap:
                     limits.MAP_OBJECTS.check(path, len(roads), "has too many roads")
                 case "junction":
                     junctions[element.attrib["id"]] = tuple(_parse_connections(element))
+                    if element.get("type") == "virtual":
+                        virtual.add(element.attrib["id"])
         except KeyError as error:
             raise InputError(f"{path}: {name}", f"the attribute {error} is missing", _HINT) from None
         except ValueError as error:
@@ -385,7 +398,7 @@ def read_opendrive(path: Path) -> OpenDriveMap:
         reference, offset_m, offset_rad = _parse_header(header)
     except ValueError as error:
         raise InputError(f"{path}: <header>", str(error), _HINT) from None
-    return OpenDriveMap(reference, offset_m, offset_rad, roads, junctions)
+    return OpenDriveMap(reference, offset_m, offset_rad, roads, junctions, frozenset(virtual))
 
 
 def _check_root(root: Element, path: Path) -> None:
@@ -440,7 +453,30 @@ def _parse_road(element: Element) -> Road:
         lane_offsets=_parse_cubics(element.iterfind("lanes/laneOffset")),
         sections=tuple(_parse_sections(element, length_m)),
         signals=tuple(map(_parse_signal, element.iterfind("signals/signal"))),
+        states_speed=_states_speed(element),
     )
+
+
+def speed_limits(road: Element) -> Iterator[tuple[float, dict[str, str]]]:
+    """Yield the speed limits of a ``<road>``: distance from its start in metres, and attributes ``max`` and ``unit``.
+
+    ``no limit``, ``undefined`` and other words are left out.
+    """
+    for kind in road.iterfind("type"):
+        speed = kind.find("speed")
+        if speed is None:
+            continue
+        try:
+            value, start_m = float(speed.get("max", "")), float(kind.get("s", "0"))
+        except ValueError:
+            continue
+        if 0 < value < math.inf and 0 <= start_m < math.inf:
+            yield start_m, {key: speed.attrib[key] for key in ("max", "unit") if key in speed.attrib}
+
+
+def _states_speed(road: Element) -> bool:
+    lanes = [lane for lane in road.iter("lane") if lane.get("type") == "driving"]
+    return any(speed_limits(road)) or all(lane.find("speed") is not None for lane in lanes)
 
 
 def _parse_plan(element: Element) -> PlanElement:
@@ -487,12 +523,42 @@ def _parse_sections(road: Element, length_m: float) -> Iterator[LaneSection]:
     elements = sorted(road.iterfind("lanes/laneSection"), key=lambda element: _number(element, "s"))
     ends = [*(_number(element, "s") for element in elements[1:]), length_m]
     for element, end_m in zip(elements, ends, strict=True):
+        widths_from_borders(element)
         lanes = [_parse_lane(lane) for side in ("left", "right") for lane in element.iterfind(f"{side}/lane")]
         if any(_integer(lane, "id") for lane in element.iterfind("center/lane")):
             raise ValueError("<center>: expected a lane with the id 0")
         by_id = {lane.id: lane for lane in sorted(lanes, key=lambda lane: lane.id)}
         start_m = _number(element, "s")
         yield LaneSection(start_m, max(start_m, end_m), by_id)
+
+
+def widths_from_borders(section: Element) -> None:
+    """Give widths to the lanes of a ``<laneSection>`` that have borders instead: the distance from the lane before.
+
+    Borders to the right are negative; those of programs that write distances instead are not.
+    """
+    for side, sign in (("left", 1), ("right", -1)):
+        inner: tuple[Cubic, ...] = ()
+        for lane in sorted(section.iterfind(f"{side}/lane"), key=lambda lane: abs(_integer(lane, "id"))):
+            borders = _parse_cubics(lane.iterfind("border"), "sOffset")
+            if borders and lane.find("width") is None:
+                for start_m in sorted({cubic.start_m for cubic in (*borders, *inner)}):
+                    outer, before = _moved(borders, start_m), _moved(inner, start_m)
+                    outwards = sign if sign * (outer[0] - before[0]) >= 0 else -sign
+                    values = [repr(outwards * (last - first)) for last, first in zip(outer, before, strict=True)]
+                    SubElement(lane, "width", {"sOffset": repr(start_m)} | dict(zip("abcd", values, strict=True)))
+            for border in lane.findall("border"):
+                lane.remove(border)
+            inner = borders
+
+
+def _moved(cubics: Sequence[Cubic], start_m: float) -> tuple[float, float, float, float]:
+    """Return the coefficients of piecewise polynomials from another start on; 0 without polynomials."""
+    if not cubics:
+        return 0.0, 0.0, 0.0, 0.0
+    cubic = next((cubic for cubic in reversed(cubics) if cubic.start_m <= start_m), cubics[0])
+    by_m, (_, a, b, c, d) = start_m - cubic.start_m, cubic
+    return a + by_m * (b + by_m * (c + by_m * d)), b + by_m * (2 * c + by_m * 3 * d), c + 3 * d * by_m, d
 
 
 def _parse_lane(element: Element) -> RoadLane:

@@ -5,7 +5,9 @@ imports parking and other lanes that no traffic uses; takes lanes in their order
 traffic, expects the ids of lanes of right-hand traffic, which it draws on the other side of the reference line. It
 divides by the curvature of an arc, and by the change of curvature along a spiral: where these are so small that the
 shape differs from a line or an arc by less than :data:`_SAME_SHAPE_M`, the simpler shape is written. It reads no direct
-junctions (:mod:`egvs.extensions.maps.formats.direct_junctions`). What it need not know is left out.
+junctions (:mod:`egvs.extensions.maps.formats.direct_junctions`), no borders of lanes, which become widths, and no speed
+limits of roads, which become those of their lanes. It moves the ends of roads to virtual junctions, which are left out. What it
+need not know is left out.
 """
 
 from __future__ import annotations
@@ -17,14 +19,17 @@ from pathlib import Path
 from typing import IO
 from xml.etree.ElementTree import Element, tostring
 
+from egvs.extensions.maps.formats import opendrive
 from egvs.extensions.maps.formats.direct_junctions import replace_direct_connections
-from egvs.extensions.maps.formats.opendrive import OpenDriveMap, Road
+from egvs.extensions.maps.formats.opendrive import OpenDriveMap, Road, widths_from_borders
 from egvs.formats import xml
 
 _ROAD_PARTS = frozenset({"link", "type", "planView", "elevationProfile", "lanes", "signals"})
 _PARTS = frozenset({"header", "road", "junction", "controller"})
 _IGNORED_TYPE = "none"
 _SAME_SHAPE_M = 1e-3
+_SHORTEST_SPEED_M = 1.0
+"""A shorter piece of road with a speed limit of its own would be an edge of this length."""
 _SWAPPED_CHANGES = {"increase": "decrease", "decrease": "increase"}
 
 
@@ -60,11 +65,13 @@ def write_copy(path: Path, road_map: OpenDriveMap, to: Path, options: CopyOption
         for element in xml.iter_elements(path, ""):
             for inner in element.iter():
                 inner.tag = inner.tag.rpartition("}")[2]
-            if element.tag not in _PARTS:
+            if element.tag not in _PARTS or _is_of_virtual_junction(element, road_map):
                 continue
             added = []
-            if element.tag == "road" and not options.keeps_all_lights:
-                _remove_other_lights(element, road_map.roads[element.attrib["id"]])
+            if element.tag == "road":
+                _remove_virtual_links(element, road_map)
+                if not options.keeps_all_lights:
+                    _remove_other_lights(element, road_map.roads[element.attrib["id"]])
             elif element.tag == "junction":
                 added = replace_direct_connections(element, road_map, lefthand=options.swap_lanes)
             for part in (element, *added):
@@ -88,6 +95,23 @@ def _change(element: Element, options: CopyOptions) -> None:
             for link in element.iter("laneLink"):
                 _negate(link, "from")
                 _negate(link, "to")
+
+
+def _is_of_virtual_junction(element: Element, road_map: OpenDriveMap) -> bool:
+    identifier = element.get("id", "")
+    if element.tag == "junction":
+        return identifier in road_map.virtual
+    return element.tag == "road" and road_map.is_in_virtual_junction(identifier)
+
+
+def _remove_virtual_links(road: Element, road_map: OpenDriveMap) -> None:
+    """Remove the links of a ``<road>`` to virtual junctions and to the roads through them."""
+    for links in road.iterfind("link"):
+        for link in list(links):
+            name = link.get("elementId", "")
+            is_junction = link.get("elementType") == "junction"
+            if name in road_map.virtual if is_junction else road_map.is_in_virtual_junction(name):
+                links.remove(link)
 
 
 def _remove_other_lights(element: Element, road: Road) -> None:
@@ -121,6 +145,9 @@ def _change_road(road: Element, options: CopyOptions) -> None:
     for lane in road.iter("lane"):
         if not options.keeps_type(lane.get("type", _IGNORED_TYPE)):
             lane.set("type", _IGNORED_TYPE)
+    _copy_speeds_to_lanes(road)
+    for section in road.iter("laneSection"):
+        widths_from_borders(section)
     for geometry in road.iter("geometry"):
         _simplify(geometry)
         if options.rotation_rad:
@@ -128,6 +155,23 @@ def _change_road(road: Element, options: CopyOptions) -> None:
     if options.swap_lanes:
         _swap_lanes(road)
     _sort_lanes(road)
+
+
+def _copy_speeds_to_lanes(road: Element) -> None:
+    """Give the speed limits of a road to its lanes that state none."""
+    limits = sorted(opendrive.speed_limits(road), key=lambda limit: limit[0])
+    sections = sorted(road.iterfind("lanes/laneSection"), key=lambda section: float(section.attrib["s"]))
+    starts_m = [float(section.attrib["s"]) for section in sections]
+    for section, start_m, end_m in zip(sections, starts_m, [*starts_m[1:], float(road.attrib["length"])], strict=True):
+        by_offset = {
+            offset_m if offset_m >= _SHORTEST_SPEED_M else 0.0: speed
+            for offset_m, speed in ((max(0.0, at_m - start_m), speed) for at_m, speed in limits)
+            if offset_m == 0 or offset_m <= end_m - start_m - _SHORTEST_SPEED_M
+        }
+        for lane in section.iter("lane"):
+            if lane.find("speed") is None and lane.get("id") != "0":
+                for offset_m, speed in by_offset.items():
+                    lane.append(Element("speed", speed | {"sOffset": repr(offset_m)}))
 
 
 def _simplify(geometry: Element) -> None:

@@ -155,8 +155,10 @@ class NetworkBuilder:
         self, connections: list[PlainElement], signals: list[PlainElement], flags: Sequence[str]
     ) -> list[PlainElement]:
         """Return the roundabouts that netconvert finds."""
+        counted, self.assumed = self.assumed, rules.Assumptions()
         nodes = [self._node(node, 0) for node in self._layout.nodes()]
         edges = [self._edge(road, 0.0) for road in self._layout.roads.values()]
+        self.assumed = counted  # these roads are not counted again
         text = self._convert(PlainNetwork(self._frame, nodes, edges, connections, signals), flags)
         try:
             rings = read_network_text(text).roundabouts
@@ -170,8 +172,8 @@ class NetworkBuilder:
         try:
             return plain.build(flags)
         except sumo.SumoInputError as error:
-            problem = f"netconvert cannot build a network of its lanelets: {error}"
-            raise InputError(self._where, problem, _EDITOR_HINT) from None
+            problem = "netconvert cannot build a network of its lanelets"
+            raise error.for_input(self._where, problem, _EDITOR_HINT) from None
 
     def _node(self, node: str, attempt: int) -> PlainElement:
         x, y, z = self._shapes.position_m(node).tolist()

@@ -250,9 +250,11 @@ def _problem_notes(
 
 def _quality_notes(quality: NetworkQuality, opened: Sequence[tuple[str, int]]) -> Iterator[str]:
     """Yield how the network differs from the map."""
-    yield f"Lanes are at most {quality.max_lane_error_m:.2f} m from the centre lines of the lanelets."
     if quality.bad_lanes:
-        yield f"Lanes more than {MAX_LANE_ERROR_M:g} m off: {_count(quality.bad_lanes)}."
+        yield (
+            f"Lanes more than {MAX_LANE_ERROR_M:g} m off the centre lines of their lanelets, up to"
+            f" {quality.max_lane_error_m:.2f} m: {_count(quality.bad_lanes)}."
+        )
     yield from turn_notes(lost=list(map(str, quality.turns.lost)), added=list(map(str, quality.turns.added)))
     if opened:
         lanes = [f"{road}_{index}" for road, index in opened]

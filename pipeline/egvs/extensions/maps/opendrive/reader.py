@@ -200,8 +200,8 @@ def _projection(road_map: OpenDriveMap, path: Path) -> tuple[str, tuple[str, ...
     text = _GEOID.sub("", road_map.reference).strip()
     if not text:
         return "", ("The map declares no reference system; the network has its metres.",)
-    problem = f"The map's reference system ({text[:60]!r}) names no map projection; the network has the map's metres."
-    if text.startswith("+") and "+proj=" not in text:
+    problem = f"The map's reference system ({text[:60]!r}) is no map projection in metres; the network has the map's."
+    if text.startswith("+") and "+proj=" not in text and "+init=" not in text:
         return "", (problem,)
     try:
         georeference.WorldFrame.from_projection(text, (0.0, 0.0), str(path))
@@ -216,8 +216,8 @@ def _netconvert_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except sumo.SumoInputError as error:
-        problem = f"netconvert cannot use the map: {error}"
-        raise InputError(path, problem, "Correct the map, or export it again.") from None
+        hint = "Correct the map, or export it again."
+        raise error.for_input(path, "netconvert cannot use the map", hint) from None
 
 
 def _patch(folder: Path, made: MadeNetwork, comparison: MapComparison, options: RoadOptions, path: Path) -> str:
@@ -361,8 +361,22 @@ def comparison_notes(comparison: MapComparison, road_map: OpenDriveMap) -> tuple
 
 
 def _map_notes(road_map: OpenDriveMap) -> tuple[str, ...]:
-    """Return sentences on what no network can have."""
-    notes = []
+    """Return sentences on what no network can have, and on what the map does not state."""
+    notes = ["Road classes are assumed by speed limit."]
+    roads = [road for road in road_map.roads.values() if not road.junction]
+    without_speed = [road.id for road in roads if not road.states_speed]
+    if without_speed:
+        notes.append(
+            f"{len(without_speed)} of {number_of(len(roads), 'road')} {by_number(len(without_speed), 'has', 'have')} no"
+            f" speed limit: 50 km/h assumed, {_listed(without_speed)}."
+        )
+    if road_map.virtual:
+        count = len(road_map.virtual)
+        passing = [road for road in road_map.roads if road_map.is_in_virtual_junction(road)]
+        notes.append(
+            f"{number_of(count, 'virtual junction')}, which {by_number(count, 'joins', 'join')} roads between their"
+            f" ends, and the roads through {by_number(count, 'it', 'them')} are left out: {_listed(passing) or 'none'}."
+        )
     sloped = [road.id for road in road_map.roads.values() if any(any(cubic[1:]) for cubic in road.superelevations)]
     if sloped:
         notes.append(

@@ -143,24 +143,32 @@ def _enter(road_map: OpenDriveMap, link: Link, lane: int, roads: int) -> Iterato
     if not road.junction:
         yield LaneKey(road.id, section, lane)
         return
-    for target, next_link in _through(road, section, lane, forward):
+    for target, next_link in _through(road_map, road, section, lane, forward):
         yield from _enter(road_map, next_link, target, roads + 1)
 
 
-def _through(road: Road, section: int, lane: int, forward: bool) -> Iterator[tuple[int, Link]]:
-    """Yield the lanes of the next road that a lane of a connecting road leads to, through all its sections."""
+def _through(road_map: OpenDriveMap, road: Road, section: int, lane: int, forward: bool) -> Iterator[tuple[int, Link]]:
+    """Yield the lanes of the next road that a lane of a connecting road leads to, through all its sections.
+
+    Where the road leads into another junction, these are lanes of the connecting roads there.
+    """
     found = road.sections[section].lanes[lane]
     linked = found.successors if forward else found.predecessors
     next_section = section + (1 if forward else -1)
     if 0 <= next_section < len(road.sections):
         for target in linked:
             if _is_driving(road, next_section, target):
-                yield from _through(road, next_section, target, forward)
+                yield from _through(road_map, road, next_section, target, forward)
         return
     link = road.successor if forward else road.predecessor
     if link is not None and link.kind == "road":
         for target in linked:
             yield target, link
+    elif link is not None:
+        for connection in road_map.junctions.get(link.id, ()):
+            if connection.incoming == road.id:
+                at = Link("road", connection.connecting, connection.contact)
+                yield from ((pair.connecting, at) for pair in connection.links if pair.incoming == lane)
 
 
 def _is_driving(road: Road, section: int, lane: int) -> bool:

@@ -15,6 +15,7 @@ alignment, if there is one.
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -51,7 +52,7 @@ from egvs.extensions.maps.point_clouds.moving_points import (
 )
 from egvs.extensions.maps.point_clouds.surface import CloudSurface, TriangleSurface, thin_points, triangulate_cloud
 from egvs.formats import point_clouds, xml
-from egvs.formats.georeference import HeightUnit, format_distance
+from egvs.formats.georeference import HeightUnit, format_distance, parse_crs
 from egvs.scenario.fields import MAX_COORDINATE_M
 
 THIN_CELL_M = 0.075
@@ -62,6 +63,9 @@ LARGE_SCAN = 1_000_000
 
 NOT_FINITE, MARKED, MOVING, THINNED = "not_finite", "marked", "moving", "thinned"
 """Reasons to leave out points, beside ``out_of_range``."""
+
+_SAME_POSITION_M, _SAME_UNIT = 1.0, 1e-4
+"""Two reference systems of a file agree up to these; the US survey foot and the foot differ by 2e-6."""
 
 _SUFFIXES = ("csv", "e57", "las", "laz", "pcd", "ply")
 _PACKABLE = ("csv", "pcd", "ply")
@@ -181,6 +185,9 @@ def _read_file(survey: _Survey, path: Path, context: MapContext) -> None:
             if number == 0:
                 crs = context.usable_crs(partial(point_clouds.point_cloud_crs, plain, where), where)
                 survey.units.setdefault(_unit_note(context.height_unit(crs, where)))
+                other = point_clouds.other_point_cloud_crs(plain, where)
+                if crs is not None and other is not None:
+                    survey.units.update(dict.fromkeys(_disagreement(chunk.points_m, crs, other, context, where)))
             if chunk.scan not in scans:
                 scans[chunk.scan] = _Scan(_station(chunk.station_m, crs, context, where))
             survey.points_read += len(chunk.points_m)
@@ -203,6 +210,26 @@ def _read_file(survey: _Survey, path: Path, context: MapContext) -> None:
         )
         raise InputError(where, problem, "Check its coordinate reference system, or its --align.")
     survey.scans += scans.values()
+
+
+def _disagreement(points: FloatArray, crs: str, other: str, context: MapContext, where: str) -> Iterator[str]:
+    """Yield a sentence where the second reference system of a file gives other positions or another unit of heights."""
+    finite = points[np.isfinite(points).all(axis=1)][:1]
+    used, not_used = (parse_crs(text, where).name for text in (crs, other))
+    units = [context.height_unit(text, where) for text in (crs, other)]
+    differences = []
+    if len(finite):
+        used_m, other_m = (context.to_world(finite[:, :2], text, where)[0] for text in (crs, other))
+        distance_m = math.dist(used_m, other_m)
+        if distance_m > _SAME_POSITION_M:
+            differences.append(f"positions {format_distance(distance_m)} away")
+    if not math.isclose(units[0].metres, units[1].metres, rel_tol=_SAME_UNIT):
+        differences.append(f"heights in the unit {units[1].name} instead of {units[0].name}")
+    if differences:
+        yield (
+            f"{where} declares two reference systems that disagree: {used} is used, as its header says; {not_used}"
+            f" would give {' and '.join(differences)}."
+        )
 
 
 def _unit_note(unit: HeightUnit) -> str:
