@@ -30,15 +30,16 @@ SUFFIX = ".zip"
 MAX_MEMBERS = 10_000
 """Largest number of files in an archive."""
 
+MAX_NAME_LENGTH = 1000
+"""Largest number of characters of the path of a file in an archive."""
+
+_NAME_ERRNOS = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL)
+
 MAX_DEPTH = 3
 """Deepest nesting of archives in archives."""
 
 _SIGNATURES = (b"PK\x03\x04", b"PK\x05\x06")
 _OTHER_ZIP_FORMATS = (".kmz", ".xlsx", ".ods", ".npz", ".usdz")
-MAX_NAME_LENGTH = 1000
-"""Largest number of characters of the path of a file in an archive."""
-
-_NAME_ERRNOS = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EILSEQ, errno.EINVAL)
 _CHUNK_BYTES = 1 << 20
 _CANNOT_READ = "cannot be read as a ZIP archive"
 _UNPACK_HINT = "Unpack it, and give the file or the folder."
@@ -136,7 +137,7 @@ def _unpack(path: Path, where: str, folder: Path, size: int = 0, depth: int = 1)
     for archive in filter(zipfile.is_zipfile, inner):
         if depth == MAX_DEPTH:
             raise InputError(archive, f"archives are nested more than {MAX_DEPTH} deep", _UNPACK_HINT)
-        packed = archive.rename(archive.with_name(f"{archive.name}.packed"))
+        packed = archive.rename(archive.with_name(".packed"))  # no member has such a name
         archive.mkdir()
         size = _unpack(packed, os.fspath(archive), archive, size, depth + 1)
         packed.unlink()
