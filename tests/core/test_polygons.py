@@ -139,7 +139,7 @@ def test_parts_are_repaired_one_by_one() -> None:
 def test_accepts_long_valid_shapes() -> None:
     check_crossings([houses(40, 40)], "tiles")
     check_edge_pairs(shapely.LineString([(i * 0.01, math.sin(i * 0.001)) for i in range(50_000)]), "dense lane", 1.6)
-    assert repair_polygon(comb(800), "comb").is_valid
+    assert repair_polygon(comb(700), "comb").is_valid
 
 
 @pytest.mark.parametrize("name", ["lanes", "outlines"])

@@ -83,7 +83,7 @@ XML_ELEMENTS = Limit("EGVS_MAX_XML_ELEMENTS", 10_000_000, "elements", "an XML fi
 POINTS = Limit("EGVS_MAX_POINTS", 30_000_000, "points", "a point cloud")
 TRIANGLES = Limit("EGVS_MAX_TRIANGLES", 5_000_000, "triangles", "a mesh")
 CORNERS = Limit(
-    "EGVS_MAX_CORNERS", 3500, "corners", "one polygon with its holes: the time to cut it can grow with their cube"
+    "EGVS_MAX_CORNERS", 3000, "corners", "one polygon with its holes: the time to cut it can grow with their cube"
 )
 EDGE_PAIRS = Limit(
     "EGVS_MAX_EDGE_PAIRS",

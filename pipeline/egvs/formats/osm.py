@@ -18,7 +18,7 @@ import sys
 import tempfile
 from collections.abc import Generator
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -130,7 +130,7 @@ class OsmExtract:
     relations: tuple[Relation, ...]
     bounds: Bounds
     declared: bool
-    path: Path = Path("extract")
+    path: Path = field(default=Path("extract"), compare=False)
 
 
 def read_osm(path: Path) -> OsmExtract:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -125,7 +125,7 @@ class LaneletMap:
     is_autoware: bool = False
     incomplete: tuple[int, ...] = ()
     missing_members: int = 0
-    path: Path = Path("map")
+    path: Path = field(default=Path("map"), compare=False)
 
 
 def is_lanelet2(path: Path) -> bool:
