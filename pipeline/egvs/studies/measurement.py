@@ -84,7 +84,6 @@ class SettingRunner:
         self._source = SettingsSource(path, tuple(overrides))
         self._jobs, self._progress = jobs, progress
         self._folder, self._store = out / STUDY_FOLDER, Store.default()
-        files.check_no_link(self._folder / "times" / "-")
         try:
             (self._folder / "times").mkdir(parents=True, exist_ok=True)
             for leftover in self._folder.glob(".work-*"):  # of a study that was killed
