@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import importlib.util
 import random
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -204,11 +205,11 @@ def test_two_reference_systems_that_disagree_are_named(tmp_path: Path) -> None:
     points = np.column_stack([x + 500_000, y + 4_600_000, np.full(x.size, 3.0)])
     context = MapContext(WorldFrame("EPSG:32615", (-500_000.0, -4_600_000.0)), box(-50, -50, 50, 50))
     for code, said in (("EPSG:32615+6360", "heights in the unit US survey foot instead of metre."),
-                       ("EPSG:32616", "positions 498 km away."), ("EPSG:32615", "")):  # fmt: skip
+                       ("EPSG:32616", r"positions (49[89]|50[01]) km away."), ("EPSG:32615", "")):  # fmt: skip
         path = write_las(tmp_path / "a.las", UTM_15, CRS(code).to_wkt("WKT1_GDAL"), points=points)
         found = [note for note in point_cloud.read_solids([path], context).notes if "disagree" in note]
         assert len(found) == bool(said)
-        assert all(note.startswith(f"{path} declares two") and note.endswith(said) for note in found)
+        assert all(note.startswith(f"{path} declares two") and re.search(f"{said}$", note) for note in found)
 
 
 @needs_laspy
