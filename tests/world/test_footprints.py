@@ -206,7 +206,7 @@ def test_number_of_corners_has_a_limit(tmp_path, monkeypatch):
 
 
 def test_pairs_of_edges_add_up_over_a_file(tmp_path, monkeypatch):
-    """One wall that runs to and fro is built; of ten, those that are too many are rejected."""
+    """One wall that runs back and forth is built; of ten, those that are too many are rejected."""
     zigzag = {"type": "LineString", "coordinates": [[0.01 * x, 10 * (x % 2)] for x in range(40)]}
     wall = feature(zigzag, height_m=1, radius_m=0.25)
     monkeypatch.setenv("EGVS_MAX_EDGE_PAIRS", "5000")
