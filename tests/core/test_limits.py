@@ -43,13 +43,11 @@ def test_names_of_limits_are_unique() -> None:
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (MemoryError(), "it needs more memory than is available"),
         (RecursionError("maximum"), "it is nested too deeply"),
         (ValueError("first\nsecond"), "first"),
         (KeyError("x"), "KeyError 'x'"),
         (AssertionError(), "AssertionError"),
         (OverflowError("too large"), "too large"),
-        (PermissionError(errno.EACCES, "Permission denied"), "Permission denied"),
         (UnicodeDecodeError("utf-8", b"\xff", 0, 1, ""), "it is not utf-8 text: byte 0 is 0xff"),
     ],
 )
@@ -58,6 +56,19 @@ def test_translate_errors_names_the_file(error: Exception, message: str) -> None
         raise error
     assert str(refused.value) == f"x.ply: cannot be read ({message}). Use a mesh."
     assert refused.value.__cause__ is error
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (MemoryError(), "it needs more memory than is available). Use a smaller file, or a machine with more memory."),
+        (PermissionError(errno.EACCES, "Permission denied"), "Permission denied). Check the path and the permissions."),
+    ],
+)
+def test_errors_of_the_machine_do_not_blame_the_file(error: Exception, expected: str) -> None:
+    with pytest.raises(InputError) as refused, translate_errors("x.ply", "Use a mesh."):
+        raise error
+    assert str(refused.value) == f"x.ply: cannot be read ({expected}"
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from tests.extensions.city.conftest import write_city
 from tests.extensions.maps.lanelet2_maps import make_crossing
 from tests.extensions.tracks.boxes import moving_boxes
 from tests.extensions.tracks.writers import TrackRows, write_sind, write_user_table
+from tests.formats.workbooks import write_xlsx
 from tests.fuzz import read_signals, read_tracks
 
 _KINDS = SCENARIO[SCENARIO.index("[[traffic.kinds]]") : SCENARIO.index("[statics]")]
@@ -393,6 +394,13 @@ def sites(folder: Path) -> None:
     """Sites as GeoJSON."""
     made = mini(folder, ('"sites.csv"', '"sites.geojson"'))
     (made / "sites.geojson").write_text(GEOJSON_SITES)
+
+
+def in_workbook(folder: Path) -> None:
+    """Sites in a workbook."""
+    made = mini(folder, ('"sites.csv"', '"sites.xlsx"'))
+    rows = [line.split(",") for line in (made / "sites.csv").read_text().splitlines()]
+    write_xlsx(made / "sites.xlsx", {"Sites": rows})
 
 
 def beams(folder: Path) -> None:

@@ -151,7 +151,7 @@ def _signals(file: str, reads: Meaning, *others: str) -> Kind:
 def _labels(form: str, reads: Meaning) -> Kind:
     """Labels of measured sweeps."""
     verb = ("validate", "scenario", "--against", "sweeps", "--labels", "labels", "--sensor", "small", "--detector",
-            "points", "--out", "made", *(("--columns", "type=class,x_m=cx") if form == "csv" else ()))  # fmt: skip
+            "points", "--out", "made", "--yaw", "x-ccw", *(("--columns", "type=class,x_m=cx") if form == "csv" else ()))  # fmt: skip
     made = ("made/against.json",)
     return Kind(f"labels {form}", "labels/*", bases.labelled(form), reads, verb=verb, results=made)
 
@@ -183,6 +183,7 @@ _ALL = (
     _input("mesh.ply", "house.ply", bases.mesh("house.ply"), meaning.ply),
     Kind("terrain.ply", "scenario/terrain.ply", bases.terrain, meaning.ply, results=("out/statics.ply",)),
     _input("sites.csv", "sites.csv", bases.plain, meaning.rows),
+    _input("sites.xlsx", "sites.xlsx", bases.in_workbook, meaning.bytes_themselves),
     _input("sites.geojson", "sites.geojson", bases.sites, meaning.text_json),
     _input("beams.csv", "beams.csv", bases.beams, meaning.rows),
     _input("metadata.json", "metadata.json", bases.metadata, meaning.text_json),
@@ -300,6 +301,7 @@ FORMATS = {
     "polygons of any format": ("poly.xml", "new houses.geojson", "new city.gml"),
     "tables in CSV": ("sites.csv", "junctions.csv", "new counts.csv", "signals.csv", "observed.csv", "labels csv"),
     "XML of any kind": ("net.xml", "vtypes.xml", "new city.gml", "new terrain.xml", "new roads.xodr"),
+    "workbooks (xlsx, xls, ods)": ("sites.xlsx",),
     "gzip of any file": ("net.xml.gz", "fcd.csv.gz", "new map.osm.gz", "sweep sweep.ply.gz"),
     "FCD in Parquet": ("fcd.parquet", "fcd.parquet.gz"),
     "tracks in CSV": ("tracks 07_tracks.csv", "tracks tracks.csv", "tracks 10001.csv"),
