@@ -151,7 +151,8 @@ def _signals(file: str, reads: Meaning, *others: str) -> Kind:
 def _labels(form: str, reads: Meaning) -> Kind:
     """Labels of measured sweeps."""
     verb = ("validate", "scenario", "--against", "sweeps", "--labels", "labels", "--sensor", "small", "--detector",
-            "points", "--out", "made", "--yaw", "x-ccw", *(("--columns", "type=class,x_m=cx") if form == "csv" else ()))  # fmt: skip
+            "points", "--out", "made", "--yaw", "x-ccw",
+            *(("--columns", "type=class,x_m=cx") if form == "csv" else ()))  # fmt: skip
     made = ("made/against.json",)
     return Kind(f"labels {form}", "labels/*", bases.labelled(form), reads, verb=verb, results=made)
 
