@@ -160,3 +160,12 @@ def test_draped_scenario_runs_to_a_ranking(flat_road: Path, tmp_path: Path) -> N
     x, y, z = world.vertices_m[near].T
     expected = 0.05 * (x - 300) + 0.1 * np.maximum(np.abs(y) - 12, 0)
     assert z == pytest.approx(expected, abs=0.02) and len(x) > 1000
+
+
+def test_far_point_of_a_terrain_costs_no_time(flat_road: Path) -> None:
+    """The rim of the ground has a point each 50 m, but not on a side of 40,000 km."""
+    roads = network.read_net_xml(flat_road / "road.net.xml")
+    far = np.concatenate([grid_points(), [[40.0, 4e7, 0.0]]])
+    ground = terrain.triangulate_ground(roads, beyond_m=far)
+    assert len(ground.vertices_m) < len(grid_points()) + 20_000
+    assert ground.height_m(np.array([300.0]), np.array([0.0])) == pytest.approx([0.0], abs=1e-6)

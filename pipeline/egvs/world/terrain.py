@@ -64,6 +64,9 @@ _BESIDE_M = 5.0
 _CROSSING_STEP_M = 1.0
 
 _RIM_STEP_M = 50.0
+_MAX_RIM_STEPS = 2000
+"""On each side, which is 100 km then. The time grows with the square, and one point of a terrain may be far away."""
+
 _MARGIN_M = 100.0
 _EPSILON = 1e-12
 
@@ -327,7 +330,7 @@ def _thin_points(points: Floats) -> Floats:
 
 def _rim(low: Floats, high: Floats) -> Floats:
     """Return points (n, 2) along the sides of a rectangle."""
-    steps = np.ceil((high - low) / _RIM_STEP_M).astype(int) + 1
+    steps = np.minimum(np.ceil((high - low) / _RIM_STEP_M), _MAX_RIM_STEPS).astype(int) + 1
     xs = np.linspace(low[0], high[0], steps[0])
     ys = np.linspace(low[1], high[1], steps[1])
     horizontal = [np.column_stack([xs, np.full(xs.size, y)]) for y in (low[1], high[1])]
