@@ -9,6 +9,8 @@ import pytest
 from egvs.core import readers
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.creation import map_readers
+from egvs.creation.map_parts import RoadMap
+from egvs.creation.road_source import NetworkRoads
 from tests.core.test_plugins import install_readers, site  # noqa: F401  the fixture
 from tests.installed import needs
 
@@ -134,3 +136,13 @@ def test_module_without_what_its_reader_gives_is_rejected(site: Path) -> None:  
     file = map_readers.MapFile(site / "a.walls", map_readers.find_reader(site / "a.walls"))
     with pytest.raises(MissingBackendError, match="plug_walls has no read_solids; expected a module with read_roads"):
         _ = file.module
+
+
+def test_unusable_network_names_the_map_and_no_temporary_file(tmp_path: Path) -> None:
+    lane = '<lane id="a_0" index="0" speed="10" length="9" shape="0,0 x,9"/>'
+    road_map = RoadMap(f'<net version="1.20"><edge id="a" from="b" to="c">{lane}</edge></net>')
+    with pytest.raises(InputError) as caught:
+        NetworkRoads.read(road_map, tmp_path / "roads.xodr")
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path / 'roads.xodr'}: the network cannot be used: ")
+    assert "network.net.xml" not in message

@@ -91,7 +91,9 @@ class NetworkRoads:
             try:
                 return cls(road_map, junctions.read_streets(folder / NETWORK_FILE), path)
             except InputError as error:
-                raise InputError(path, f"the network cannot be used: {error}", "Check the roads of the map.") from None
+                element = error.where.removeprefix(str(folder / NETWORK_FILE)).removeprefix(": ")
+                problem = f"{element}: {error.problem}" if element else error.problem
+                raise InputError(path, f"the network cannot be used: {problem}", "Correct its roads.") from None
 
     @property
     def network(self) -> str:
