@@ -88,5 +88,5 @@ def test_decimal_comma_has_its_hint(problem: str, is_comma: bool) -> None:
     assert InputError("a.csv", problem, "Use numbers.").hint == (DECIMAL_COMMA_HINT if is_comma else "Use numbers.")
 
 
-def test_further_errors_are_kept_beside_a_decimal_comma() -> None:
+def test_decimal_comma_hides_no_further_errors() -> None:
     assert InputError("a.csv", "expected a number, got '4,5'", "\nb.csv: is empty").hint == "\nb.csv: is empty"

@@ -99,7 +99,7 @@ def divided_road() -> tuple[MapDraft, dict[str, int]]:
 
 
 @pytest.mark.parametrize("walk", [False, True])
-def test_restriction_inside_junction_is_kept(walk: bool) -> None:
+def test_restriction_inside_junction_holds(walk: bool) -> None:
     draft, ways = divided_road()
     relation = draft.restrict("no_left_turn", ways["middle"], draft.via((0.0, -APART_M)), ways["to east"])
     forbidden = str(ways["north"]), str(ways["to east"])
@@ -113,7 +113,7 @@ def test_restriction_inside_junction_is_kept(walk: bool) -> None:
     assert walkways[0].crossings == walkways[1].crossings and bool(walkways[0].crossings) == walk
 
 
-def test_restriction_between_objects_without_numbers_of_openstreetmap_is_kept() -> None:
+def test_restriction_between_objects_with_negative_ids_holds() -> None:
     """Editors give new objects negative numbers: edge -11 is way -11, not way 11 against its direction."""
     draft, ways = divided_road()
     draft.restrict("no_left_turn", ways["middle"], draft.via((0.0, -APART_M)), ways["to east"])
@@ -132,7 +132,7 @@ def test_restriction_between_objects_without_numbers_of_openstreetmap_is_kept() 
     assert (f"-{ways['north']}", f"-{ways['south']}") in turns and len(turns) == len(edge_turns(build(made)))
 
 
-def test_restriction_over_way_inside_junction_is_kept() -> None:
+def test_restriction_over_way_inside_junction_holds() -> None:
     """From the north to the east is forbidden; from the west to the east is not."""
     draft, ways = divided_road()
     draft.restrict("no_left_turn", ways["north"], [Member("way", ways["middle"], "via")], ways["to east"])

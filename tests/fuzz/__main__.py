@@ -42,7 +42,7 @@ def fuzz(kinds: list[str], number: int, seed: int, keep: Path, in_one: bool = Fa
             if not (left := [case for case in share if (kind, case) not in done]):
                 continue
             folder = Path(temporary) / f"kind{index}"
-            judge = in_process.judge_all if in_one else _judge_all
+            judge = in_process.judge_all if in_one and not KINDS[kind].store else _judge_all
             for case, verdict in judge(KINDS[kind], folder, seed, left):
                 if verdict.name not in (*cases.WELL, *in_process.WELL):
                     _keep_bad(KINDS[kind], folder, seed, case, verdict, keep)

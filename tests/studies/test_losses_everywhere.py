@@ -65,7 +65,7 @@ def test_sensor_whose_losses_cannot_matter_has_the_bytes_of_before(mini: Path, t
     assert "losses" not in RunRecord.read(tmp_path / "far").stages["check"].summary
 
 
-def test_sensor_whose_losses_cannot_matter_has_them_beside_one_that_needs_them(mini: Path, tmp_path: Path) -> None:
+def test_all_sensors_have_losses_if_one_needs_them(mini: Path, tmp_path: Path) -> None:
     """Without them, it would gain on the other by its dropout."""
     text = (mini / "scenario.toml").read_text()
     table = text[text.index("[sensors.small]") :].partition("\n[")[0]

@@ -192,7 +192,7 @@ class DiagnosticsError(InputError):
 
 
 def raise_together(errors: Iterable[InputError], rule: str) -> None:
-    """Raise the errors of a file as one; do nothing if there are none.
+    """Raise the errors of a file as one, if it has any.
 
     The same problem in several rows, such as a misspelt column, is reported once with the first rows.
 

@@ -32,7 +32,7 @@ _HOSTS = ("127.0.0.1", "localhost")
 _MAX_PATH_LENGTH = 4096
 _REFUSAL = 'Open the address that "egvs explore" printed in the terminal; it contains the key to this page.\n'
 
-# bytes that are no request, and messages that are none of the page, are answered or end their connection; websockets
+# malformed requests, and messages that the page does not send, are answered or end their connection; websockets
 # would also print a traceback of each
 _SILENT = logging.Logger(f"{__name__}.connections", logging.CRITICAL + 1)
 

@@ -5,8 +5,8 @@ that is named like the archive. Members whose names lead out of it, links, encry
 name are errors. ZIP archives inside of archives are unpacked to folders as well, up to :data:`MAX_DEPTH`. Messages name
 the archive and the member, never the temporary folder.
 
-Beside the suffix, the first bytes tell an archive: what is named ``.zip`` but is none, such as a map in plain text, is
-left to the reader of its content, and a map that is zipped under its own name is unpacked.
+Beside the suffix, the first bytes tell an archive: a file named ``.zip`` with other content, such as a map in plain
+text, is left to the reader of its content, and a map that is zipped under its own name is unpacked.
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ def _unread_text(cell: Element) -> str:
 
 
 def _sheet_member(archive: zipfile.ZipFile, sheet: str) -> str:
-    """Return the name of the file in an xlsx file that has a sheet; an empty text where there is none."""
+    """Return the name of the file in an xlsx file that has a sheet; empty if the sheet is missing."""
     from defusedxml.ElementTree import parse
 
     try:

@@ -49,7 +49,7 @@ _READINGS = {
 
 
 def describe_free_readings(world: World, lanes: Any, low_m: FloatArray, high_m: FloatArray) -> str | None:
-    """Return the readings in which solids that cover lanes cover almost none, in words; None if there is none.
+    """Return the readings in which solids that cover lanes cover almost none, in words; None without such a reading.
 
     Parameters
     ----------

@@ -17,11 +17,11 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
@@ -40,6 +40,8 @@ from egvs.scenario.traffic_config import VehicleKind
 from egvs.traffic import fcd, sumo, sumo_folder, traffic_sources
 from egvs.traffic.network import CAR
 from egvs.traffic.vehicle_boxes import VehicleSize
+
+Value = TypeVar("Value")
 
 _NEVER = -(2**63)
 """Time of a row that does not exist."""
@@ -250,10 +252,8 @@ def vehicle_classes(scenario: Scenario, survey: FcdSurvey, vtypes: Collection[El
     vtypes
         From :func:`check_types`.
     """
-    known = {name: size.vclass for name, size in sizes_of_kinds(scenario.traffic.kinds).items()}
-    known |= {name: size.vclass for name, size in survey.sizes.items()} | _DEFAULT_TYPES
-    known |= {vtype.attrib["id"]: vtype.get("vClass", CAR) for vtype in vtypes}
-    known |= {name: size.vclass for name, size in sizes_of_kinds(scenario.traffic.named_kinds).items()}
+    of_vtypes = {vtype.attrib["id"]: vtype.get("vClass", CAR) for vtype in vtypes}
+    known = _by_type(scenario, survey, lambda size: size.vclass, _DEFAULT_TYPES | of_vtypes)
     return {name: known[name] for name in survey.types}
 
 
@@ -269,10 +269,17 @@ def vehicle_lengths_m(scenario: Scenario, survey: FcdSurvey, vtypes: Collection[
     vtypes
         From :func:`check_types`.
     """
-    known = {name: size.length_m for name, size in sizes_of_kinds(scenario.traffic.kinds).items()}
-    known |= {name: size.length_m for name, size in survey.sizes.items()}
-    known |= {vtype.attrib["id"]: number_or_nan(vtype.get("length", "")) for vtype in vtypes}
-    return known | {name: size.length_m for name, size in sizes_of_kinds(scenario.traffic.named_kinds).items()}
+    of_vtypes = {vtype.attrib["id"]: number_or_nan(vtype.get("length", "")) for vtype in vtypes}
+    return _by_type(scenario, survey, lambda size: size.length_m, of_vtypes)
+
+
+def _by_type(
+    scenario: Scenario, survey: FcdSurvey, value_of: Callable[[VehicleSize], Value], of_vtypes: Mapping[str, Value]
+) -> dict[str, Value]:
+    """Return a value by vehicle type; later sources win: kinds, the file, its <vType>s, kinds with names."""
+    kinds, named_kinds = sizes_of_kinds(scenario.traffic.kinds), sizes_of_kinds(scenario.traffic.named_kinds)
+    known = {name: value_of(size) for name, size in {**kinds, **survey.sizes}.items()}
+    return {**known, **of_vtypes, **{name: value_of(size) for name, size in named_kinds.items()}}
 
 
 def _read_vtypes(paths: Collection[Path]) -> Iterator[Element]:

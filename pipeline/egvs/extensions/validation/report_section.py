@@ -175,7 +175,7 @@ class MeasuredSection:
     template = Path(__file__).parent / "templates" / "measured.html.j2"
 
     def read(self, folder: RunFolder, scenario: Scenario, stages: Mapping[str, StageRecord]) -> list[Any] | None:
-        """Return the parts of the section; None if there are none of this run."""
+        """Return the parts of the section; None if the run has no results."""
         del scenario
         if not (folder / MEASURED.name).is_file():
             return None

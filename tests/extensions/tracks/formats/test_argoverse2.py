@@ -157,7 +157,7 @@ def test_recognises_its_files(tmp_path: Path) -> None:
         ({"tx_m": [math.nan]}, "row 1: tx_m: expected a number, got nan"),
         ({"tx_m": pa.array([None], pa.float64())}, "row 1: tx_m: is empty"),
         ({"tx_m": ["ten"]}, "tx_m: expected numbers, got values of type string"),
-        ({"tx_m": [1e300]}, "x_m: expected a number between -1e+08 and 1e+08"),
+        ({"tx_m": [1e300]}, "row 1: tx_m, ty_m, tz_m: expected coordinates of at most 1e+08 m"),
         ({"qw": [0.0], "qz": [0.0]}, "row 1: qx, qy, qz, qw: expected a quaternion, got [0.0, 0.0, 0.0, 0.0]"),
         ({"length_m": [-4.0]}, "length_m: expected a number between 0 and 100, got -4"),
         ({"track_uuid": ["x" * 5000]}, "expected a name of at most 200 characters, got 5,000"),
@@ -179,6 +179,13 @@ def test_missing_column_or_pose(tmp_path: Path) -> None:
         argoverse2.read(path)
     (tmp_path / "city_SE3_egovehicle.feather").unlink()
     with pytest.raises(InputError, match=r"expected city_SE3_egovehicle\.feather beside it"):
+        argoverse2.read(path)
+
+
+def test_far_pose_names_the_file_of_poses(tmp_path: Path) -> None:
+    path = annotations(tmp_path, poses=POSE | {"tz_m": [2e9, 0.0]})
+    message = r"city_SE3_egovehicle\.feather: row 1: tx_m, ty_m, tz_m: expected coordinates of at most 1e\+08 m, got \["
+    with pytest.raises(InputError, match=message):
         argoverse2.read(path)
 
 

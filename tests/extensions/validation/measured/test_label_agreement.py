@@ -20,7 +20,7 @@ from egvs.core.grid import FloatArray
 from egvs.extensions.validation.measured.label_agreement import (
     AgreementRequest,
     AgreementRow,
-    JudgedList,
+    ComparedList,
     compare_lists,
 )
 from egvs.extensions.validation.measured.list_poses import SAME, find_pose
@@ -49,17 +49,17 @@ def folders(tmp_path_factory: pytest.TempPathFactory, lists: Lists) -> tuple[Pat
 
 
 @pytest.fixture(scope="module")
-def judged(folders: tuple[Path, Path]) -> list[JudgedList]:
-    """Both lists, each judged by the other."""
+def tested(folders: tuple[Path, Path]) -> list[ComparedList]:
+    """Both lists, each tested by the other."""
     return compare_lists(AgreementRequest(folders, sensors=(SENSOR,)))
 
 
-def total(judged: JudgedList, group: str = "cars") -> AgreementRow:
-    return next(row for row in judged.rows if row.group == group and row.high == 80.0 and row.low == 0.0)
+def total(tested: ComparedList, group: str = "cars") -> AgreementRow:
+    return next(row for row in tested.rows if row.group == group and row.high == 80.0 and row.low == 0.0)
 
 
-def test_the_printed_level_is_what_was_found(judged: list[JudgedList]) -> None:
-    for item in judged:
+def test_printed_level_is_the_measured_one(tested: list[ComparedList]) -> None:
+    for item in tested:
         cars = total(item)
         assert cars.boxes > 200 and cars.objects > 30 and cars.people is not None and cars.difference is not None
         assert cars.difference.value == pytest.approx(cars.people.value - cars.found.value)
@@ -68,9 +68,9 @@ def test_the_printed_level_is_what_was_found(judged: list[JudgedList]) -> None:
         assert 0.3 < cars.found.value < 0.9 and cars.by_chance.value < 0.15
 
 
-def test_the_curve_is_found_by_points(judged: list[JudgedList]) -> None:
+def test_curve_by_points(tested: list[ComparedList]) -> None:
     """Few points are noticed less often than many."""
-    for item in judged:
+    for item in tested:
         cars = [row for row in item.point_rows if row.group == "cars"]
         few = sum(row.found.value * row.boxes for row in cars if row.high <= 5) / sum(
             row.boxes for row in cars if row.high <= 5
@@ -83,27 +83,27 @@ def test_the_curve_is_found_by_points(judged: list[JudgedList]) -> None:
 
 
 @pytest.mark.slow
-def test_poses_are_those_of_the_files_or_found_by_boxes(tmp_path: Path, lists: Lists, judged: list[JudgedList]) -> None:
+def test_poses_from_files_or_boxes(tmp_path: Path, lists: Lists, tested: list[ComparedList]) -> None:
     """The sensors are 13.9 m apart, turned by 35 degrees, and 0.5 m apart in height."""
     paths = tuple(
         two_sensors.write_openlabel(tmp_path / name, labels, None)
         for name, labels in zip(("south", "north"), lists, strict=True)
     )
     without = compare_lists(AgreementRequest(paths, sensors=(SENSOR,)))
-    assert any("13.9 m apart, by their poses in s110_base" in note for note in judged[0].notes)
+    assert any("13.9 m apart, by their poses in s110_base" in note for note in tested[0].notes)
     assert any("by their boxes, they are 13.9 m apart, turned by 35.0 degrees" in note for note in without[0].notes)
     assert any("7.50 m below the sensor (pitch -1.60, roll 1.50" in note for note in without[0].notes)
-    for one, other in zip(judged, without, strict=True):
+    for one, other in zip(tested, without, strict=True):
         assert total(one).found.value == pytest.approx(total(other).found.value, abs=0.01)
         assert total(one).people.value == pytest.approx(total(other).people.value, abs=0.02)  # type: ignore[union-attr]
 
 
 @pytest.mark.slow
-def test_tables_and_lists_in_one_frame(tmp_path: Path, lists: Lists, judged: list[JudgedList]) -> None:
+def test_tables_and_lists_in_one_frame(tmp_path: Path, lists: Lists, tested: list[ComparedList]) -> None:
     first, second = lists
     paths = two_sensors.write_table(tmp_path / "a.csv", first), two_sensors.write_table(tmp_path / "b.csv", second)
     by_table = compare_lists(AgreementRequest(paths, sensors=(SENSOR, SENSOR), columns=COLUMNS))
-    assert total(by_table[0]).found.value == pytest.approx(total(judged[0]).found.value, abs=0.01)
+    assert total(by_table[0]).found.value == pytest.approx(total(tested[0]).found.value, abs=0.01)
     assert any("Headings are taken as x-ccw, which the labels do not state" in note for note in by_table[0].notes)
     same = compare_lists(AgreementRequest((paths[0], paths[0]), columns=COLUMNS))
     assert total(same[0]).found.value == 1.0 and total(same[0]).people is None
@@ -234,7 +234,7 @@ def test_frames_that_do_not_fit_are_refused() -> None:
         find_pose(centres, "a, b")
 
 
-def test_a_pose_is_recovered_and_the_same_frame_kept() -> None:
+def test_pose_is_recovered_and_shared_frame_detected() -> None:
     rng = np.random.default_rng(2)
     centres, same = [], []
     for _ in range(20):

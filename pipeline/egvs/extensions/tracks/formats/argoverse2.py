@@ -24,6 +24,7 @@ from egvs.core.grid import FloatArray
 from egvs.extensions.tracks.boxes import ClassNames, make_tracks, to_rotations, yaw_of
 from egvs.extensions.tracks.formats.arrow_tables import ArrowTable, column_names
 from egvs.extensions.tracks.model import TrackFrame, Tracks
+from egvs.scenario.fields import MAX_COORDINATE_M
 
 _STEP_S = 0.1
 _POSES_FILE = "city_SE3_egovehicle.feather"
@@ -131,7 +132,12 @@ def _transforms(table: ArrowTable) -> tuple[FloatArray, FloatArray]:
     for row in np.flatnonzero(~np.isfinite(rotations).all(axis=(1, 2))):
         problem = f"expected a quaternion, got {quaternions[row].tolist()}"
         raise InputError(f"{table.path}: row {row + 1}: qx, qy, qz, qw", problem, "Correct the row, or remove it.")
-    return rotations, np.column_stack([table.numbers(name) for name in _TRANSLATION])
+    translations = np.column_stack([table.numbers(name) for name in _TRANSLATION])
+    for row in np.flatnonzero(~(np.abs(translations) <= MAX_COORDINATE_M).all(axis=1)):
+        problem = f"expected coordinates of at most {MAX_COORDINATE_M:g} m, got {translations[row].tolist()}"
+        where = f"{table.path}: row {row + 1}: {', '.join(_TRANSLATION)}"
+        raise InputError(where, problem, "Correct the row, or remove it.")
+    return rotations, translations
 
 
 def _tracks(path: Path, names: list[str], kinds: list[str], columns: dict[str, FloatArray], cities: set[str]) -> Tracks:

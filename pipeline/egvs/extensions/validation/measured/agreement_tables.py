@@ -10,7 +10,7 @@ from pathlib import Path
 from egvs.cli.console import Column, print_sentences, print_table
 from egvs.core.wording import number_of
 from egvs.extensions.validation.measured.figures import Panel, Series, range_figure
-from egvs.extensions.validation.measured.label_agreement import NEARER_M, AgreementRow, JudgedList, ScoreRow
+from egvs.extensions.validation.measured.label_agreement import NEARER_M, AgreementRow, ComparedList, ScoreRow
 from egvs.extensions.validation.measured.list_poses import NEAR_M
 from egvs.extensions.validation.measured.pages import MeasuredPage, PageTable, write_pages
 from egvs.extensions.validation.measured.ratios import Ratio
@@ -41,9 +41,9 @@ def difference_text(ratio: Ratio | None) -> str:
     return value if math.isnan(ratio.se) else f"{value} ± {200 * ratio.se:.0f}"
 
 
-def columns(judged: JudgedList, *, by_points: bool = False) -> list[Column[AgreementRow]]:
+def columns(tested: ComparedList, *, by_points: bool = False) -> list[Column[AgreementRow]]:
     """Return the columns of the table by range, or by points."""
-    has = "found" if judged.is_detections else "labelled"
+    has = "found" if tested.is_detections else "labelled"
     first: Column[AgreementRow] = Column("range", range_text, "left")
     if by_points:
         first = Column("simulated points", points_text, "left")
@@ -56,7 +56,7 @@ def columns(judged: JudgedList, *, by_points: bool = False) -> list[Column[Agree
         Column(f"within {NEARER_M:g} m", lambda row: share_text(row.found_nearer)),
         Column("by chance", lambda row: share_text(row.by_chance)),
     ]
-    if judged.sensor is not None:
+    if tested.sensor is not None:
         listed += [
             Column("people", lambda row: share_text(row.people)),
             Column(f"people - {has}", lambda row: difference_text(row.difference)),
@@ -74,73 +74,73 @@ SCORE_COLUMNS: list[Column[ScoreRow]] = [
 ]
 
 
-def title(judged: JudgedList) -> str:
+def title(tested: ComparedList) -> str:
     """Return what a table is about."""
-    what = "detections" if judged.is_detections else "labels"
-    return f"Of what {join_names(judged.others)} has, what do the {what} {judged.name} have? (± 2 se)"
+    what = "detections" if tested.is_detections else "labels"
+    return f"Of what {join_names(tested.others)} has, what do the {what} {tested.name} have? (± 2 se)"
 
 
-def sentences(judged: JudgedList) -> Iterator[str]:
+def sentences(tested: ComparedList) -> Iterator[str]:
     """Yield what the tables mean, and what was assumed."""
-    cars = next((row for row in judged.rows if row.group == "cars" and row.high == FARTHEST_M), None)
-    sensor = "" if judged.sensor is None else f", by {judged.sensor}"
-    yield f"{judged.name}{sensor}: {number_of(judged.sweeps, 'pair')} of sweeps."
+    cars = next((row for row in tested.rows if row.group == "cars" and row.high == FARTHEST_M), None)
+    sensor = "" if tested.sensor is None else f", by {tested.sensor}"
+    yield f"{tested.name}{sensor}: {number_of(tested.sweeps, 'pair')} of sweeps."
     if cars is not None:
-        has = "finds" if judged.is_detections else "has"
+        has = "finds" if tested.is_detections else "has"
         text = f"It {has} {share_text(cars.found)} of the cars within {FARTHEST_M:g} m"
         if not math.isnan(cars.by_chance.value):
             text += f" ({share_text(cars.by_chance)} by chance)"
         if cars.people is not None and cars.difference is not None:
             text += f"; people should notice {share_text(cars.people)}: {difference_text(cars.difference)} points"
         yield f"{text}."
-    if judged.losses is not None:
+    if tested.losses is not None:
         yield (
-            f"Points are simulated on boxes, with losses: rated range {judged.losses.rated_range_m:g} m at "
-            f"{judged.losses.rated_reflectivity:g}, reflectivity of cars {judged.losses.target_reflectivity():g}."
+            f"Points are simulated on boxes, with losses: rated range {tested.losses.rated_range_m:g} m at "
+            f"{tested.losses.rated_reflectivity:g}, reflectivity of cars {tested.losses.target_reflectivity():g}."
         )
-    yield from judged.notes
+    yield from tested.notes
 
 
-def print_agreement(results: Sequence[JudgedList]) -> None:
-    """Print tables and sentences of each judged list."""
-    for number, judged in enumerate(results):
-        print_sentences([*([""] if number else []), title(judged)])
-        if judged.rows:
-            print_table(columns(judged), judged.rows, file_width=_FILE_WIDTH)
-        if judged.point_rows:
+def print_agreement(results: Sequence[ComparedList]) -> None:
+    """Print tables and sentences of each tested list."""
+    for number, tested in enumerate(results):
+        print_sentences([*([""] if number else []), title(tested)])
+        if tested.rows:
+            print_table(columns(tested), tested.rows, file_width=_FILE_WIDTH)
+        if tested.point_rows:
             print_sentences(["", f"The same by simulated points, to {FARTHEST_M:g} m (± 2 se)"])
-            print_table(columns(judged, by_points=True), judged.point_rows, file_width=_FILE_WIDTH)
-        if judged.score_rows:
+            print_table(columns(tested, by_points=True), tested.point_rows, file_width=_FILE_WIDTH)
+        if tested.score_rows:
             print_sentences(["", "By the score of detections (± 2 se)"])
-            print_table(SCORE_COLUMNS, judged.score_rows, file_width=_FILE_WIDTH)
-        print_sentences(["", *sentences(judged)])
+            print_table(SCORE_COLUMNS, tested.score_rows, file_width=_FILE_WIDTH)
+        print_sentences(["", *sentences(tested)])
 
 
-def write_agreement(results: Sequence[JudgedList], folder: Path, scenario: Scenario | None = None) -> list[Path]:
+def write_agreement(results: Sequence[ComparedList], folder: Path, scenario: Scenario | None = None) -> list[Path]:
     """Write the results as JSON, and the page; return the files.
 
     Errors and ``scenario`` as of :func:`egvs.extensions.validation.measured.pages.write_pages`.
     """
-    values = [asdict(judged) | {"notes": list(sentences(judged))} for judged in results]
-    over = join_names([judged.name for judged in results])
-    return write_pages([to_page(judged) for judged in results], without_nan(values), over, folder, scenario)
+    values = [asdict(tested) | {"notes": list(sentences(tested))} for tested in results]
+    over = join_names([tested.name for tested in results])
+    return write_pages([to_page(tested) for tested in results], without_nan(values), over, folder, scenario)
 
 
-def to_page(judged: JudgedList) -> MeasuredPage:
-    """Return the part of the page on one judged list."""
+def to_page(tested: ComparedList) -> MeasuredPage:
+    """Return the part of the page on one tested list."""
     tables = []
-    if judged.rows:
-        tables.append(PageTable.of("By range (± 2 se)", columns(judged), judged.rows))
-    if judged.point_rows:
+    if tested.rows:
+        tables.append(PageTable.of("By range (± 2 se)", columns(tested), tested.rows))
+    if tested.point_rows:
         heading = f"By simulated points, to {FARTHEST_M:g} m (± 2 se)"
-        tables.append(PageTable.of(heading, columns(judged, by_points=True), judged.point_rows))
-    if judged.score_rows:
-        tables.append(PageTable.of("By the score of detections (± 2 se)", SCORE_COLUMNS, judged.score_rows))
-    first, *others = sentences(judged)
+        tables.append(PageTable.of(heading, columns(tested, by_points=True), tested.point_rows))
+    if tested.score_rows:
+        tables.append(PageTable.of("By the score of detections (± 2 se)", SCORE_COLUMNS, tested.score_rows))
+    first, *others = sentences(tested)
     return MeasuredPage(
-        heading=title(judged).removesuffix(" (± 2 se)"),
+        heading=title(tested).removesuffix(" (± 2 se)"),
         lede=" ".join([first, *others[:1]]),
-        figure=_figure(judged),
+        figure=_figure(tested),
         caption="Share of the boxes of the other list by range, with two standard errors where there are enough blocks "
         "of time.",
         tables=tuple(tables),
@@ -148,17 +148,17 @@ def to_page(judged: JudgedList) -> MeasuredPage:
     )
 
 
-def _figure(judged: JudgedList) -> str:
+def _figure(tested: ComparedList) -> str:
     panels = []
-    has = "found" if judged.is_detections else "labelled"
+    has = "found" if tested.is_detections else "labelled"
     for group in ("cars", "larger vehicles"):
-        rows = [row for row in judged.rows if row.group == group and (row.low, row.high) != (0.0, FARTHEST_M)]
+        rows = [row for row in tested.rows if row.group == group and (row.low, row.high) != (0.0, FARTHEST_M)]
         if not rows:
             continue
         series = [Series(f"{has} within {NEAR_M:g} m", {_ends(row): row.found for row in rows})]
-        if judged.is_detections:
+        if tested.is_detections:
             series.append(Series(f"{has} within {NEARER_M:g} m", {_ends(row): row.found_nearer for row in rows}))
-        if judged.sensor is not None:
+        if tested.sensor is not None:
             series.append(Series("people should notice", {_ends(row): row.people for row in rows if row.people}))
             series.append(Series("models expect", {_ends(row): row.detectors for row in rows if row.detectors}))
         panels.append(Panel(group, tuple(_ends(row) for row in rows), tuple(series), in_percent=True))

@@ -31,7 +31,7 @@ _SHAPES = (
 
 @dataclass(frozen=True)
 class Series:
-    """Values by range; NaN or a missing category where there are none."""
+    """Values by range; a category without a value is missing or NaN."""
 
     name: str
     values: dict[str, Ratio]

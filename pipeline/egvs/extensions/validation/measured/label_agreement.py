@@ -5,13 +5,13 @@ Two sensors of one place are labelled, each by itself. A box of one list that al
 share of boxes that were noticed is an answer to "how many points does it take?" which no simulation gives. Detections
 of one sensor take the place of the second list: then it is the share with a box of the detector.
 
-Steps, for each list that is *judged* by the others: pair sweeps by time or name; place boxes of both lists above the
-judged sensor; let boxes of the others, and those that only the judged list has, hide one another; count the points that
+Steps, for each list that is *tested* by the others: pair sweeps by time or name; place boxes of both lists above the
+tested sensor; let boxes of the others, and those that only the tested list has, hide one another; count the points that
 the simulation, with the losses of the sensor, puts on each box (on boxes, as scores count); compare the share that was
 noticed with the curves of :mod:`egvs.scoring.noticed` and with the models of detectors, by group, range and points.
 
 Vehicles are found by vehicles, people and bicycles by people and bicycles, all by boxes of no known class. Some boxes
-are found by chance, in queues: the share that stands in the list 60 s later says how many. Places where the judged list
+are found by chance, in queues: the share that stands in the list 60 s later says how many. Places where the tested list
 never has a box of a road user, although others have 20 different ones there, are not in its labelled area, and are left
 out; a detector has none.
 
@@ -42,7 +42,7 @@ from egvs.extensions.validation.measured.comparison import (
     return_model,
     visible_boxes,
 )
-from egvs.extensions.validation.measured.list_pairs import LabelList, PlacedPair, found_boxes, place_pairs
+from egvs.extensions.validation.measured.list_pairs import LabelList, PlacedPair, match_boxes, place_pairs
 from egvs.extensions.validation.measured.list_poses import NEAR_M
 from egvs.extensions.validation.measured.ratios import FEW_OBJECTS, Ratio, ratio_of_sums
 from egvs.extensions.validation.measured.sensor_site import SensorSite
@@ -107,7 +107,7 @@ class AgreementRequest:
 
 @dataclass(frozen=True)
 class AgreementRow:
-    """Boxes of one group: what of them the judged list has, and what should be noticed.
+    """Boxes of one group: what of them the tested list has, and what should be noticed.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class AgreementRow:
     boxes, objects
         Their numbers.
     found, found_nearer
-        Share with a box of the judged list within 3 m, and within 1.5 m.
+        Share with a box of the tested list within 3 m, and within 1.5 m.
     by_chance
         Share with such a box in the list 60 s later.
     people, detectors
@@ -165,8 +165,8 @@ class ScoreRow:
 
 
 @dataclass(frozen=True)
-class JudgedList:
-    """One list, judged by the others.
+class ComparedList:
+    """One list, tested by the others.
 
     Attributes
     ----------
@@ -200,7 +200,7 @@ class JudgedList:
     notes: tuple[str, ...]
 
 
-def compare_lists(request: AgreementRequest, scenario: Scenario | None = None) -> list[JudgedList]:
+def compare_lists(request: AgreementRequest, scenario: Scenario | None = None) -> list[ComparedList]:
     """Judge lists of labels of one place by one another, or detections by labels.
 
     Parameters
@@ -208,7 +208,7 @@ def compare_lists(request: AgreementRequest, scenario: Scenario | None = None) -
     request
         The lists, and how to read them.
     scenario
-        Static world, poses and losses; without one, nothing but boxes hides anything.
+        Static world, poses and losses; without one, only boxes hide other boxes.
 
     Raises
     ------
@@ -219,20 +219,20 @@ def compare_lists(request: AgreementRequest, scenario: Scenario | None = None) -
         (labels,) = (_read_list(request, number, scenario) for number in range(len(request.labels)))
         items = read_labels((request.detections,), LabelOptions(request.columns or {}))
         detections = replace(labels, path=request.detections, labels=_in_one_convention(request, items))
-        return _with_boxes([_judge(detections, [labels], request, scenario, is_detections=True)], request)
+        return _with_boxes([_compare(detections, [labels], request, scenario, is_detections=True)], request)
     lists = [_read_list(request, number, scenario) for number in range(len(request.labels))]
-    judged = []
+    tested = []
     for number, item in enumerate(lists):
-        judged.append(_judge(item, [*lists[:number], *lists[number + 1 :]], request, scenario))
-    return _with_boxes(judged, request)
+        tested.append(_compare(item, [*lists[:number], *lists[number + 1 :]], request, scenario))
+    return _with_boxes(tested, request)
 
 
-def _with_boxes(judged: list[JudgedList], request: AgreementRequest) -> list[JudgedList]:
+def _with_boxes(tested: list[ComparedList], request: AgreementRequest) -> list[ComparedList]:
     """Return the results; InputError if no box is of a known class and in reach."""
-    if not any(item.rows for item in judged):
+    if not any(item.rows for item in tested):
         problem = f"expected vehicles or people within {RANGES_M[-1][1]} m of the other sensor, got none"
         raise InputError(request.labels[0], problem, "Check classes, units (metres) and frames of the labels.")
-    return judged
+    return tested
 
 
 def _read_list(request: AgreementRequest, number: int, scenario: Scenario | None) -> LabelList:
@@ -267,15 +267,15 @@ class _Sample:
     classes
         Class of each.
     boxes
-        In the world of the judged list, (n, 7) float64.
+        In the world of the tested list, (n, 7) float64.
     objects, blocks
         Object and block of time of each, (n,) int64.
     range_m
-        From the judged sensor, in plan, (n,) float64.
+        From the tested sensor, in plan, (n,) float64.
     found, found_nearer
-        Whether the judged list has it, within 3 m and 1.5 m, (n,) bool.
+        Whether the tested list has it, within 3 m and 1.5 m, (n,) bool.
     by_chance
-        Whether the judged list has one there 60 s later, (n,) float64; NaN where it does not last so long.
+        Whether the tested list has one there 60 s later, (n,) float64; NaN where it does not last so long.
     points, people, detectors
         Simulated points with losses, and what follows, (n,) float64; NaN without a sensor.
     used
@@ -296,53 +296,53 @@ class _Sample:
     used: NDArray[np.bool_]
 
 
-def _judge(
-    judged: LabelList,
+def _compare(
+    tested: LabelList,
     others: Sequence[LabelList],
     request: AgreementRequest,
     scenario: Scenario | None,
     *,
     is_detections: bool = False,
-) -> JudgedList:
+) -> ComparedList:
     pairs: list[PlacedPair] = []
     names: list[str] = []
-    notes = [f"{judged.pose_note[:1].upper()}{judged.pose_note[1:].removesuffix('.')}."]
+    notes = [f"{tested.pose_note[:1].upper()}{tested.pose_note[1:].removesuffix('.')}."]
     for number, other in enumerate(others):
-        placed, of_pair = place_pairs(judged, other)
+        placed, of_pair = place_pairs(tested, other)
         notes += of_pair
         pairs += placed
         names += [f"{number} {name}" for pair in placed for name in pair.other.names]
-    model = None if judged.site is None else return_model(judged.site, scenario)
-    sample, block_note = _sample(judged, pairs, names, model)
+    model = None if tested.site is None else return_model(tested.site, scenario)
+    sample, block_note = _sample(tested, pairs, names, model)
     if is_detections:  # a detector has no labelled area
         sample = replace(sample, used=np.ones(len(sample.used), dtype=np.bool_))
     if not sample.found.any():
         notes.append(f"No box is within {NEAR_M:g} m of any of the others: the frames of the lists may differ.")
     notes += [*block_note, *_area_notes(sample), *_size_notes(sample, pairs)]
-    if request.yaw is None and judged.site is not None:
-        notes += _yaw_notes(judged.site, pairs, model)
-    if judged.site is None:
+    if request.yaw is None and tested.site is not None:
+        notes += _yaw_notes(tested.site, pairs, model)
+    if tested.site is None:
         notes.append("Nothing is simulated, as the sensor is unknown: name it with --sensor.")
     elif model is None:
-        notes.append(f"{judged.site.sensor.name} has no rated range, so no losses are simulated: add rated_range_m.")
+        notes.append(f"{tested.site.sensor.name} has no rated range, so no losses are simulated: add rated_range_m.")
     if any(not pair.other.has_tracks for pair in pairs):
         notes.append("Labels have no tracks: each box counts as an object of its own.")
-    return JudgedList(
-        name=judged.name,
+    return ComparedList(
+        name=tested.name,
         others=tuple(other.name for other in others),
         is_detections=is_detections,
-        sensor=None if judged.site is None else judged.site.sensor.name,
+        sensor=None if tested.site is None else tested.site.sensor.name,
         losses=model,
         sweeps=len(pairs),
         rows=tuple(_rows_by_range(sample)),
-        point_rows=() if judged.site is None else tuple(_rows_by_points(sample)),
+        point_rows=() if tested.site is None else tuple(_rows_by_points(sample)),
         score_rows=tuple(_score_rows(pairs, sample)) if is_detections else (),
         notes=tuple(notes),
     )
 
 
 def _sample(
-    judged: LabelList,
+    tested: LabelList,
     pairs: Sequence[PlacedPair],
     names: Sequence[str],
     model: ReturnModel | None,
@@ -350,12 +350,12 @@ def _sample(
     sizes = [len(pair.boxes) for pair in pairs]
     boxes = np.concatenate([pair.boxes for pair in pairs])
     objects = np.unique(np.array(names, dtype=np.str_), return_inverse=True)[1].astype(np.int64)
-    found = np.concatenate([pair.found(NEAR_M) for pair in pairs])
+    found = np.concatenate([pair.matched(NEAR_M) for pair in pairs])
     blocks, notes = _blocks(pairs)
     unknown = np.full(len(boxes), np.nan)
     points, people, detectors = unknown, unknown, unknown
-    if judged.site is not None:
-        points, people, detectors = _levels(judged.site, pairs, model)
+    if tested.site is not None:
+        points, people, detectors = _levels(tested.site, pairs, model)
     by_box = np.repeat(blocks, sizes)
     if len(np.unique(by_box)) < FEW_OBJECTS:
         by_box = objects
@@ -368,14 +368,14 @@ def _sample(
         boxes=boxes,
         objects=objects,
         blocks=by_box,
-        range_m=np.hypot(*(boxes[:, :2] - np.asarray(judged.pose.position_m)[:2]).T),
+        range_m=np.hypot(*(boxes[:, :2] - np.asarray(tested.pose.position_m)[:2]).T),
         found=found,
-        found_nearer=np.concatenate([pair.found(NEARER_M) for pair in pairs]),
+        found_nearer=np.concatenate([pair.matched(NEARER_M) for pair in pairs]),
         by_chance=np.concatenate(list(_by_chance(pairs))),
         points=points,
         people=people,
         detectors=detectors,
-        used=_in_labelled_area(boxes, objects, [pair.judged_boxes for pair in pairs]),
+        used=_in_labelled_area(boxes, objects, [pair.tested_boxes for pair in pairs]),
     ), notes
 
 
@@ -392,7 +392,7 @@ def _blocks(pairs: Sequence[PlacedPair]) -> tuple[IntArray, list[str]]:
 
 
 def _by_chance(pairs: Sequence[PlacedPair]) -> Iterator[FloatArray]:
-    """Yield which boxes of each pair the judged list has 60 s later (or earlier); NaN if it has no such sweep."""
+    """Yield which boxes of each pair the tested list has 60 s later (or earlier); NaN if it has no such sweep."""
     times_s = np.array([pair.time_s for pair in pairs])
     timed = bool(np.isfinite(times_s).all())
     for number, pair in enumerate(pairs):
@@ -408,13 +408,13 @@ def _by_chance(pairs: Sequence[PlacedPair]) -> Iterator[FloatArray]:
         if later is None:
             yield np.full(len(pair.boxes), np.nan)
         else:
-            classes = later.judged.classes
-            yield found_boxes(pair.boxes, pair.other.classes, later.judged_boxes, classes, NEAR_M).astype(np.float64)
+            classes = later.tested.classes
+            yield match_boxes(pair.boxes, pair.other.classes, later.tested_boxes, classes, NEAR_M).astype(np.float64)
 
 
-def _in_labelled_area(boxes: FloatArray, objects: IntArray, judged: Sequence[FloatArray]) -> NDArray[np.bool_]:
-    """Return which boxes are at places where the judged list has boxes, or few objects ever were, (n,)."""
-    have_labels = set(_places(np.concatenate(judged)))
+def _in_labelled_area(boxes: FloatArray, objects: IntArray, tested: Sequence[FloatArray]) -> NDArray[np.bool_]:
+    """Return which boxes are at places where the tested list has boxes, or few objects ever were, (n,)."""
+    have_labels = set(_places(np.concatenate(tested)))
     places = _places(boxes)
     at_place: dict[tuple[int, int], set[int]] = {}
     for place, number in zip(places, objects.tolist(), strict=True):
@@ -436,12 +436,12 @@ def _places(boxes: FloatArray) -> list[tuple[int, int]]:
 
 
 def _frames(pairs: Sequence[PlacedPair]) -> list[TrafficFrame]:
-    """Return the boxes of the other list of each pair, then the judged ones that it does not have."""
+    """Return the boxes of the other list of each pair, then the tested ones that it does not have."""
     frames = []
     for number, pair in enumerate(pairs):
         alone = pair.alone(NEAR_M)
-        boxes = np.concatenate([pair.boxes, pair.judged_boxes[alone]])
-        classes = [*pair.other.classes, *(pair.judged.classes[row] for row in np.flatnonzero(alone).tolist())]
+        boxes = np.concatenate([pair.boxes, pair.tested_boxes[alone]])
+        classes = [*pair.other.classes, *(pair.tested.classes[row] for row in np.flatnonzero(alone).tolist())]
         names = tuple(f"{row} {name}" for row, name in enumerate(classes))
         frames.append(
             TrafficFrame(number, names, tuple(VCLASSES[name] for name in classes), boxes, np.zeros(len(boxes)))
@@ -518,7 +518,7 @@ def _row(sample: _Sample, group: str, rows: NDArray[np.bool_], low: float, high:
 
 def _score_rows(pairs: Sequence[PlacedPair], sample: _Sample) -> Iterator[ScoreRow]:
     """Yield what detections with at least some score find of the cars."""
-    if any(pair.judged.scores is None and len(pair.judged) for pair in pairs):
+    if any(pair.tested.scores is None and len(pair.tested) for pair in pairs):
         return
     cars = _members(sample, "cars") & (sample.range_m <= FARTHEST_M)
     if not cars.any():
@@ -526,11 +526,11 @@ def _score_rows(pairs: Sequence[PlacedPair], sample: _Sample) -> Iterator[ScoreR
     for score in SCORES:
         chosen = []
         for pair in pairs:
-            scores = pair.judged.scores
+            scores = pair.tested.scores
             chosen.append(np.zeros(0, dtype=np.bool_) if scores is None else scores >= score)
 
         def share(within_m: float, chosen: Sequence[NDArray[np.bool_]] = chosen) -> Ratio:
-            found = np.concatenate([pair.found(within_m, rows) for pair, rows in zip(pairs, chosen, strict=True)])
+            found = np.concatenate([pair.matched(within_m, rows) for pair, rows in zip(pairs, chosen, strict=True)])
             return ratio_of_sums(found[cars].astype(np.float64), np.ones(int(cars.sum())), sample.blocks[cars])
 
         alone = sum(int((pair.alone(NEARER_M) & rows).sum()) for pair, rows in zip(pairs, chosen, strict=True))

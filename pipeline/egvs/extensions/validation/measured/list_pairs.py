@@ -116,40 +116,40 @@ def _pair_by_time(
 
 @dataclass(frozen=True, eq=False)
 class PlacedPair:
-    """Boxes of a pair of sweeps above the judged sensor.
+    """Boxes of a pair of sweeps above the tested sensor.
 
     Attributes
     ----------
-    other, judged
+    other, tested
         Labels of both.
-    boxes, judged_boxes
-        Their boxes in the world of the judged list, (n, 7) and (m, 7) float64.
+    boxes, tested_boxes
+        Their boxes in the world of the tested list, (n, 7) and (m, 7) float64.
     """
 
     other: SweepLabels
-    judged: SweepLabels
+    tested: SweepLabels
     boxes: FloatArray
-    judged_boxes: FloatArray
+    tested_boxes: FloatArray
 
-    def found(self, within_m: float, judged: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-        """Return which boxes of the other list have a judged one nearby, (n,); ``judged`` chooses some of those."""
-        return found_boxes(self.boxes, self.other.classes, self.judged_boxes, self.judged.classes, within_m, judged)
+    def matched(self, within_m: float, tested: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+        """Return which boxes of the other list have a tested one nearby, (n,); ``tested`` chooses some of those."""
+        return match_boxes(self.boxes, self.other.classes, self.tested_boxes, self.tested.classes, within_m, tested)
 
     def alone(self, within_m: float) -> NDArray[np.bool_]:
-        """Return which judged boxes have none of the other list nearby, (m,)."""
-        return ~found_boxes(self.judged_boxes, self.judged.classes, self.boxes, self.other.classes, within_m)
+        """Return which tested boxes have none of the other list nearby, (m,)."""
+        return ~match_boxes(self.tested_boxes, self.tested.classes, self.boxes, self.other.classes, within_m)
 
     @property
     def time_s(self) -> float:
-        """When the sweep of the other list was recorded; that of the judged one if only this is known."""
-        return self.other.time_s if math.isfinite(self.other.time_s) else self.judged.time_s
+        """When the sweep of the other list was recorded; that of the tested one if only this is known."""
+        return self.other.time_s if math.isfinite(self.other.time_s) else self.tested.time_s
 
 
 def _kind(cls: str) -> str:
     return "" if cls == "other" else "people" if cls in GROUPS["people"] else "vehicles"
 
 
-def found_boxes(
+def match_boxes(
     boxes: FloatArray,
     classes: Sequence[str],
     others: FloatArray,
@@ -169,32 +169,32 @@ def found_boxes(
     return found
 
 
-def place_pairs(judged: LabelList, other: LabelList) -> tuple[list[PlacedPair], list[str]]:
-    """Return pairs of sweeps with all boxes in the world of the judged list, and sentences on how that was done."""
-    pairs = pair_sweeps(other, judged)
+def place_pairs(tested: LabelList, other: LabelList) -> tuple[list[PlacedPair], list[str]]:
+    """Return pairs of sweeps with all boxes in the world of the tested list, and sentences on how that was done."""
+    pairs = pair_sweeps(other, tested)
     notes = []
-    for one, count in ((other, len(other.labels)), (judged, len(judged.labels))):
+    for one, count in ((other, len(other.labels)), (tested, len(tested.labels))):
         if count > len(pairs):
             notes.append(f"{one.name}: {number_of(count - len(pairs), 'sweep')} without a partner left out.")
-    place = [boxes_in_world(judged.pose, item.boxes) for _, item in pairs]
-    shared, other_shared = judged.shared_pose, other.shared_pose
-    if judged.site is other.site and judged.pose == other.pose:
-        moved = [boxes_in_world(judged.pose, item.boxes) for item, _ in pairs]  # in the sweeps of the same sensor
-    elif judged.is_in_scenario:
+    place = [boxes_in_world(tested.pose, item.boxes) for _, item in pairs]
+    shared, other_shared = tested.shared_pose, other.shared_pose
+    if tested.site is other.site and tested.pose == other.pose:
+        moved = [boxes_in_world(tested.pose, item.boxes) for item, _ in pairs]  # in the sweeps of the same sensor
+    elif tested.is_in_scenario:
         moved = [boxes_in_world(other.pose, item.boxes) for item, _ in pairs]
     elif shared is not None and other_shared is not None and shared.frame == other_shared.frame:
         rotation = shared.rotation.T @ other_shared.rotation
         translation_m = shared.rotation.T @ (other_shared.translation_m - shared.translation_m)
         in_sensor = [move_boxes(item.boxes, rotation, translation_m) for item, _ in pairs]
-        moved = [boxes_in_world(judged.pose, boxes) for boxes in in_sensor]
+        moved = [boxes_in_world(tested.pose, boxes) for boxes in in_sensor]
         apart_m = float(np.sqrt((translation_m**2).sum()))
         notes.append(f"The sensors are {apart_m:.1f} m apart, by their poses in {shared.frame}.")
     else:
         level = [boxes_in_world(other.pose, item.boxes) for item, _ in pairs]
         centres = [(a[:, :2], b[:, :2]) for a, b in zip(level, place, strict=True)]
-        pose = find_pose(centres, f"{other.path}, {judged.path}")
+        pose = find_pose(centres, f"{other.path}, {tested.path}")
         if pose == SAME:
-            moved = [boxes_in_world(judged.pose, item.boxes) for item, _ in pairs]
+            moved = [boxes_in_world(tested.pose, item.boxes) for item, _ in pairs]
             notes.append(
                 "No file says where the sensors are; most boxes stand together, so both lists are in one frame."
             )
@@ -205,8 +205,8 @@ def place_pairs(judged: LabelList, other: LabelList) -> tuple[list[PlacedPair], 
                 f"apart, turned by {math.degrees(pose.turn_rad):.1f} degrees."
             )
     placed = []
-    for (item, other_item), boxes, judged_boxes in zip(pairs, moved, place, strict=True):
-        placed.append(PlacedPair(item, other_item, boxes, judged_boxes))
+    for (item, other_item), boxes, tested_boxes in zip(pairs, moved, place, strict=True):
+        placed.append(PlacedPair(item, other_item, boxes, tested_boxes))
     return placed, notes
 
 

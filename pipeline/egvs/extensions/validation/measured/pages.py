@@ -71,7 +71,7 @@ def write_pages(
     folder
         Where the files are written.
     scenario
-        World of the comparison; a section is added to a run of this scenario, or to any run if there is none.
+        World of the comparison; a section is added to runs of this scenario; None adds it to any run.
 
     Raises
     ------

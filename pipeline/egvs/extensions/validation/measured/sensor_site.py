@@ -122,7 +122,7 @@ def pose_above_boxes(labels: Sequence[SweepLabels]) -> tuple[Pose, str]:
     pitch_deg, roll_deg = np.degrees([np.arcsin(normal[0]), np.arctan2(normal[1], normal[2])]).tolist()
     sentence = (
         f"the lower faces of {number_of(len(boxes), 'box', 'boxes')} are {height_m:.2f} m below the sensor "
-        f"(pitch {pitch_deg:.2f}, roll {roll_deg:.2f} degrees); nothing but boxes hides vehicles"
+        f"(pitch {pitch_deg:.2f}, roll {roll_deg:.2f} degrees); vehicles are hidden by other boxes only"
     )
     return Pose(0.0, 0.0, height_m, 0.0, pitch_deg, roll_deg), sentence
 
