@@ -8,7 +8,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # Every process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run environment test test-slow test-nightly without test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics pictures schema reference docs notebooks fuzz clean
+.PHONY: run environment test test-slow test-nightly without test-train test-lowest test-portable unit check lint wheel project-files image image-test bench bench-history bench-peers scaling numerics pictures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -56,6 +56,10 @@ test-portable: $(VENV)/.installed-dev
 # The quick loop: no other program is started, nothing takes long.
 unit: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m unit
+
+# Before a commit: lint, types, contracts, and the tests nearest to what changed since BASE (default: main).
+check: $(VENV)/.installed-dev
+	$(BIN)/python .ci/changed.py $(BASE)
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
