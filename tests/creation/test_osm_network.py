@@ -1,13 +1,19 @@
 """Streets of an extract, cut at a circle around the junction."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from egvs.creation import junctions
+from egvs.creation.map_parts import RoadOptions
 from egvs.creation.openstreetmap import street_network
+from egvs.creation.openstreetmap.reader import OsmRoads
 from egvs.formats import osm
-from egvs.formats.osm import Bounds, OsmExtract, Way
+from egvs.formats.osm import Bounds, Member, OsmExtract, Relation, Way
+from tests.creation.small_maps import degrees, street, write_map
 
 CENTRE = (52.0, 10.0)
 
@@ -49,6 +55,54 @@ def test_streets_end_on_the_circle() -> None:
         extract({7: [(-500, 0), (0, 0), (80, 0)], 8: [(0, -90), (0, 0), (0, 200)]}), CENTRE, 100
     )
     assert lines_m(cut) == {7: [(-100, 0), (0, 0), (80, 0)], 8: [(0, -90), (0, 0), (0, 100)]}
+
+
+def test_far_streets_are_dropped_with_their_turn_restrictions() -> None:
+    streets = {
+        7: [(-900, 0), (900, 0)],
+        8: [(0, 40), (0, 300)],
+        9: [(150, 160), (300, 160)],
+        10: [(300, 160), (400, 0)],
+    }
+    house = {11: [(500, 500), (510, 500), (500, 510), (500, 500)]}
+    restrictions = tuple(
+        Relation(number, (Member("way", a, "from"), Member("way", b, "to")), {"type": "restriction"})
+        for number, (a, b) in enumerate([(7, 8), (7, 9), (9, 10)])
+    )
+    every = replace(extract(streets | house, {11: {"building": "yes"}}), relations=restrictions)
+    near = street_network.drop_far_streets(every, CENTRE, 100.0)
+    assert sorted(near.ways) == [7, 8, 11]
+    assert near.relations == restrictions[:1]
+    assert street_network.drop_far_streets(every, CENTRE, math.inf) is every
+
+
+@pytest.mark.slow  # netconvert reads a whole town
+@pytest.mark.system
+def test_network_around_a_position_is_that_of_the_complete_map(tmp_path: Path) -> None:
+    """Streets of a grid, 150 m apart and 2.4 km wide; the frame may differ, for netconvert chooses it."""
+    steps = range(17)
+    nodes = {100 * x + y: (150.0 * (x - 8), 150.0 * (y - 8)) for x in steps for y in steps}
+    ways = [street(f"east {y}", 100 * x + y, 100 * (x + 1) + y) for x in steps[:-1] for y in steps]
+    ways += [street(f"north {x}", 100 * x + y, 100 * x + y + 1) for x in steps for y in steps[:-1]]
+    path, middle = write_map(tmp_path / "map.osm", nodes, ways), degrees((0.0, 0.0))
+    networks, n_edges = [], []
+    for position in (None, middle):
+        roads = OsmRoads.read(path, RoadOptions(at=position, righthand=True))
+        (at_m,) = roads.streets.to_xy([middle[1]], [middle[0]])
+        chosen = junctions.choose_nearby(junctions.nearest_junctions(roads.streets, at_m))
+        assert chosen is not None
+        streets = roads.around(chosen.junction, None).streets
+        networks.append(
+            {
+                edge.id: [streets.to_degrees(np.array(lane.shape_m)[:, :2]) for lane in edge.lanes]
+                for edge in streets.network.edges
+            }
+        )
+        n_edges.append(len(roads.streets.network.edges))
+    assert n_edges[1] < 0.6 * n_edges[0]
+    assert networks[0].keys() == networks[1].keys()
+    for edge, lanes in networks[0].items():
+        np.testing.assert_allclose(lanes, networks[1][edge], atol=2e-7)  # 2 cm
 
 
 @pytest.mark.system

@@ -190,6 +190,9 @@ class RoadOptions:
     at
         Latitude, longitude in degrees of the requested junction, or x, y in metres if the map has no reference system;
         None if any will do. A reader may reject a position outside its map.
+    surroundings_m
+        Distance from the junction at which streets will end; None if the reader decides, inf for the complete map.
+        With ``at``, a reader may leave out what is farther away.
     """
 
     lefthand: bool = False
@@ -197,6 +200,7 @@ class RoadOptions:
     has_terrain: bool = False
     at: tuple[float, float] | None = None
     righthand: bool = False
+    surroundings_m: float | None = None
 
     @property
     def requested_left(self) -> bool | None:

@@ -453,7 +453,9 @@ def _open_files(
 def _read_roads_and_recordings(draft: _Draft) -> None:
     """Read all roads of the map, and find the reader of each recording."""
     options, has_terrain = draft.options, bool(draft.files.terrain)
-    road_options = RoadOptions(options.lefthand, options.walk, has_terrain, draft.at, options.righthand)
+    road_options = RoadOptions(
+        options.lefthand, options.walk, has_terrain, draft.at, options.righthand, options.surroundings_m
+    )
     draft.map_roads = _read_roads(draft.files.roads, road_options)
     draft.recordings = new_traffic.find_recordings(draft.options.recordings)
 

@@ -29,6 +29,10 @@ from egvs.formats.osm import OsmExtract
 SURROUNDINGS_M = 300.0
 """How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
 
+_BEYOND_M = 500.0
+"""With a position, streets are read up to this distance beyond the surroundings: the junction can be up to
+:data:`~egvs.creation.junctions.MAX_FROM_POINT_M` from it, and streets that meet outside may be joined to one node."""
+
 _ONE_LEVEL = OtherLevels()
 
 
@@ -74,7 +78,7 @@ class OsmRoads:
 
     @classmethod
     def read(cls, path: Path, options: RoadOptions) -> OsmRoads:
-        """Read an extract and build the network of all its streets.
+        """Read an extract and build the network of all its streets, or of those around a position.
 
         Parameters
         ----------
@@ -103,6 +107,9 @@ class OsmRoads:
             if elevations.heights_m:
                 extract = elevation.add_elevations(extract, elevations.heights_m)
                 flags += elevation.ELEVATION_FLAGS
+        if options.at is not None:
+            reach_m = _BEYOND_M + (SURROUNDINGS_M if options.surroundings_m is None else options.surroundings_m)
+            extract = osm_network.drop_far_streets(extract, options.at, reach_m)
         network, streets, turn_notes = osm_network.build_network(extract, path, flags)
         return cls(extract, path, tuple(flags), network, streets, map_notes=notes, turn_notes=turn_notes)
 

@@ -286,6 +286,49 @@ def cut_surroundings(extract: OsmExtract, middle: tuple[float, float], radius_m:
     return replace(inside, ways={i: way for i, way in inside.ways.items() if i in connected or not is_road(way)})
 
 
+def drop_far_streets(extract: OsmExtract, middle: tuple[float, float], distance_m: float) -> OsmExtract:
+    """Return the extract without the streets that are completely farther away than a distance.
+
+    Parameters
+    ----------
+    extract
+        The map.
+    middle
+        Latitude, longitude in degrees.
+    distance_m
+        Half the side of a square around the middle; streets whose bounding box meets it stay. All stay if it is inf.
+    """
+    if math.isinf(distance_m):
+        return extract
+    lat_deg, lon_deg = middle
+    north_deg = math.degrees(distance_m / EARTH_M)
+    east_deg = north_deg / math.cos(math.radians(lat_deg))
+
+    def is_near(way: Way) -> bool:
+        positions = [extract.nodes[node] for node in way.nodes if node in extract.nodes]
+        if not positions:
+            return True
+        lats, lons = zip(*positions, strict=True)
+        return (
+            min(lats) <= lat_deg + north_deg
+            and max(lats) >= lat_deg - north_deg
+            and min(lons) <= lon_deg + east_deg
+            and max(lons) >= lon_deg - east_deg
+        )
+
+    far = {way.id for way in extract.ways.values() if "highway" in way.tags and not is_near(way)}
+    relations = tuple(
+        relation
+        for relation in extract.relations
+        if not (
+            is_restriction(relation) and any(member.type == "way" and member.id in far for member in relation.members)
+        )
+    )
+    return replace(
+        extract, ways={number: way for number, way in extract.ways.items() if number not in far}, relations=relations
+    )
+
+
 def cut_out_roads(extract: OsmExtract, streets: Streets, roads: Sequence[Way], region: BaseGeometry) -> OsmExtract:
     """Return the extract without those segments of some roads that touch a region.
 
