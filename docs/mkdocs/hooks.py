@@ -1,5 +1,5 @@
 """Add to the documentation site what comes from the program: the diagram of the packages, tables of public names
-and of study results, a reference page for each package, the notebooks, and formulas as MathML."""
+and of data, a reference page for each package, the notebooks, and formulas as MathML."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _VIEW = ROOT / "build" / "view.html"
 """The 3D view of a run, which `make docs` writes. Without it, the first page links to docs/explore.md."""
 _LINK_WITHOUT_VIEW = "](explore.md#one-file-to-share)"
 _ELSEWHERE = "https://unpkg.com/iframe-worker/shim"
-_INSERT = re.compile(r"<!-- (names of|picture of|study conditions|study table) ([\w-]+) -->")
+_INSERT = re.compile(r"<!-- (names of|picture of|study conditions|study table|data table) ([\w-]+) -->")
 
 
 def on_config(config: MkDocsConfig) -> None:
@@ -107,4 +107,5 @@ _MAKE = {
     "picture of": lambda _: package_diagram.picture(),
     "study conditions": tables.study_conditions,
     "study table": tables.study_tables,
+    "data table": tables.data_table,
 }

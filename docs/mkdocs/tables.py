@@ -1,8 +1,9 @@
-"""Markdown tables for the site: the public names of a package, and the tables of the validity study."""
+"""Markdown tables for the site: the public names of a package, tables of the validity study, and files of data."""
 
 from __future__ import annotations
 
 import ast
+import csv
 import re
 import sys
 from functools import cache
@@ -57,6 +58,13 @@ def study_conditions(_: str) -> str:
 def study_tables(stem: str) -> str:
     """The tables of one CSV file of the validity study, each with its caption."""
     return "\n".join(study.markdown(table) for table in _study()[1][f"{stem}.csv"])
+
+
+def data_table(stem: str) -> str:
+    """All rows of ``docs/data/<stem>.csv``."""
+    with (ROOT / "docs" / "data" / f"{stem}.csv").open(encoding="utf-8", newline="") as file:
+        head, *rows = csv.reader(file)
+    return "\n".join("| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows])
 
 
 def study_files() -> set[str]:
