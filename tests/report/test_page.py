@@ -251,17 +251,6 @@ def test_compares_sensors_where_there_are_several(tmp_path):
     assert "docs/validity.md" in section
 
 
-def test_shows_what_one_more_percentage_point_costs(tmp_path):
-    costs = {"sensor": {"small": 1000, "dense": 4000}}
-    section = sensor_section(tmp_path, costs=costs)
-    scores = read_scores(tmp_path / "out" / "scores.parquet").to_pydict()
-    seen = dict(zip(scores["site"], scores["seen_well"], strict=True))
-    points = 100 * (seen["n dense"] - max(seen["n small"], seen["s"]))
-    assert points > 0
-    assert f'data-label="One more point costs">{3000 / points:,.0f}<' in section
-    assert "PRICE" not in section
-
-
 def test_has_no_section_on_sensors_with_one_sensor(plain_run):
     assert "Which sensor?" not in plain_run[2]
 

@@ -84,7 +84,7 @@ def place(
     if exact and not (placed.is_best or placed.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
     plans = RunRecord.read(folder).traffic_summary.get("signals", ())
-    caveats = [sections.describe_caveats(loaded, "plan", plans=plans)]
+    caveats = [sections.main_assumptions(sections.assumptions(loaded, plans))]
     if placed.fused is not None and placed.fused.noticed is not None:
         caveats.append(sensor_text.upper_limit_note(loaded, [sensor.sensor for sensor in placed.sensors]))
     print_placement(placed, notes, [caveat for caveat in caveats if caveat])
@@ -119,13 +119,14 @@ def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveats: Sequ
     from egvs.cli.console import WIDE, console, print_sentences
 
     out = console(WIDE, soft_wrap=False)
+    print_sentences([describe_plan(placed)])
     out.print(_sensor_table(placed, out.width))
     if any(sensor.forced for sensor in placed.sensors):
         out.print("* already installed")
-    out.print()
-    out.print(_curve_table(placed, out.width))
+    if not _is_nested(placed):
+        out.print()
+        out.print(_curve_table(placed, out.width))
     print_sentences([describe_errors(placed)])
-    out.print()
     for zone in placed.zones:
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
         out.print(
@@ -134,9 +135,16 @@ def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveats: Sequ
         )
     if worst := worst_zones(placed.zone_results):
         print_sentences([describe_worst_zones("the plan", worst)])
-    print_sentences([describe_plan(placed), *notes, *_further_sentences(placed), *caveats])
+    print_sentences([*notes, *_further_sentences(placed), *caveats])
     for path in placed.files:
         out.print(str(path), soft_wrap=True)
+
+
+def _is_nested(placed: SensorPlan) -> bool:
+    """Whether the best plans of fewer sensors are the first sensors of the plan, so that its table has them all."""
+    sites = [sensor.site for sensor in placed.sensors]
+    plans = [step.sites for step in placed.curve]
+    return placed.refinement is None and all(set(plan) == set(sites[: len(plan)]) for plan in plans)
 
 
 def _further_sentences(placed: SensorPlan) -> Iterator[str]:
@@ -284,7 +292,7 @@ def describe_errors(placed: SensorPlan) -> str:
     if placed.has_errors:
         text = f"± is one standard error, from {placed.errors_from}"
         if placed.by.name == DEFAULT_SCORE:
-            text += "; it is without the error of the level, which was measured for single sensors only"
+            text += "; without the error of the level, which is known for single sensors only"
         return text
     return f"no standard errors: {placed.errors_from}"
 

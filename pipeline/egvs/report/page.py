@@ -54,7 +54,14 @@ from egvs.report.sections import (
     describe_poles_on_road,
     study_values,
 )
-from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, has_losses, range_note
+from egvs.report.sensor_text import (
+    LOSSES_EVIDENCE,
+    costs_option,
+    describe_evidence,
+    explain_sensor_differences,
+    has_losses,
+    range_note,
+)
 from egvs.results import labels as formatting
 from egvs.results.labels import SCORE_LABELS
 from egvs.results.levels import GROUPS_NOTE, DetectionLevel, GroupLevel, read_levels
@@ -471,9 +478,9 @@ def _sensor_values(contents: PageContents) -> dict[str, Any]:
         "sensors": sensors,
         "range_note": range_note(names, is_modelled=has_losses(contents.scenario, names)),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
-        "sensors_explanation": explain_differences(sensors) if sensors is not None else "",
+        "sensors_explanation": explain_sensor_differences(sensors) if sensors is not None else "",
         "sensors_preference": sensor_text.noticed_preference(sensors) if sensors is not None else "",
-        "sensors_evidence": describe_evidence(sensors) if sensors is not None else "",
+        "sensors_evidence": f"{describe_evidence(sensors)} {LOSSES_EVIDENCE}" if sensors is not None else "",
     }
 
 

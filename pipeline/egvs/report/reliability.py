@@ -76,6 +76,8 @@ def describe_reliability(
     if ranking.has_errors and (seeds > 1 or ranking.by.name == DEFAULT_SCORE):
         notes.append(_error_note(seeds, "recording" if recordings else "simulation", detectors))
     if ranking.by.name == DEFAULT_SCORE:
+        if len(detectors) > 1 and not ranking.has_errors:
+            notes.append(f"The score is the mean over the detectors {join_names(detectors)}.")
         notes.append(FROM_SENSOR_NOTE if FROM_SENSOR in detectors else _size_note(detectors))
         if best.noticed is not None:
             notes.append(_NOTICED_NOTE)
