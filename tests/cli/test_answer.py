@@ -41,6 +41,8 @@ def answer_lines(printed: str, error: str) -> list[str]:
 
 def test_the_answer_has_twelve_lines(six_poles: Path, tmp_path: Path, run_egvs) -> None:
     """With warnings, assumptions and six poles; the table has as many of them as there is room for."""
+    with (six_poles / "sites.csv").open("a") as file:
+        file.write("a_5_again,10,12,5,-10\nskywards,10,12,5,60\n")
     out = tmp_path / "out"
     settings = ("--out", out, "--set", f"assumed={list(ASSUMED)}", "--set", "score.rank_by='expected_detections'")
     code, printed, error = run_egvs("run", six_poles, *settings)
@@ -60,7 +62,9 @@ def test_the_answer_has_twelve_lines(six_poles: Path, tmp_path: Path, run_egvs) 
 
 
 def test_no_fact_is_lost_in_the_report_and_with_verbose(six_poles: Path, tmp_path: Path, run_egvs) -> None:
-    """Each warning, assumption and caveat, the lead, the location and the lanes with the fewest vehicles found."""
+    """Each warning, assumption and caveat, the lead, poles and scores."""
+    with (six_poles / "sites.csv").open("a") as file:
+        file.write("a_5_again,10,12,5,-10\nskywards,10,12,5,60\n")
     out = tmp_path / "out"
     settings = ("--out", out, "--set", f"assumed={list(ASSUMED)}", "--set", "score.rank_by='expected_detections'")
     code, printed, error = run_egvs("run", six_poles, *settings, "--verbose")

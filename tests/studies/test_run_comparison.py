@@ -202,7 +202,7 @@ def test_sensors_of_one_run_on_different_poles_are_compared(mini: Path, run_egvs
     assert comparison.sensors is not None
     gain = comparison.sensors.results[1].gain
     assert gain is not None
-    assert gain.difference.is_paired
+    assert gain.is_paired
     code, printed, _ = run_egvs("compare", mini / "run")
     assert code == 0
     assert "the best mount of each sensor" in printed
@@ -235,7 +235,7 @@ def test_compare_command_prints_tables_and_notes(two: tuple[Path, Path], run_egv
     assert "pole_a" not in printed or "pole_b" not in printed.split("runs")[0]
     code, printed, _ = run_egvs("compare", *two)
     assert code == 0
-    for part in ("A z m", "B EGVS bit", "common poles"):
+    for part in ("A mount", "B EGVS bit", "common poles"):
         assert part in printed
 
 
@@ -314,8 +314,8 @@ def test_tables_of_poles_fit_the_terminal(width: int, runs: int, monkeypatch: py
     assert max(len(line) for line in tables if line.startswith(("pole", "kerb"))) <= width
     first_rows = [line for line in tables if line.startswith("kerb_0")]
     for number in range(runs):
-        assert any(f"{100 * (0.8 + 0.01 * number):.1f} % ± 0.3 %" in line for line in first_rows)
-    assert all("80.0 % ± 0.3 %" in line for line in first_rows)  # the first run is in each table
+        assert any(f"{100 * (0.8 + 0.01 * number):.1f} ± 0.3 %" in line for line in first_rows)
+    assert all("80.0 ± 0.3 %" in line for line in first_rows)  # the first run is in each table
     assert "+1.0 ± 0.4" in text
     if width == 80:
         assert "4.5 m, -10°" in first_rows[0]
@@ -352,7 +352,7 @@ def test_sentences_are_broken_between_words(width: int, monkeypatch: pytest.Monk
     lines = printed_text(comparison, width, monkeypatch).splitlines()
     first = next(number for number, line in enumerate(lines) if line.startswith("Do not decide between"))
     paragraph = lines[first : lines.index("", first)]
-    assert len(paragraph) > 2
+    assert len(paragraph) >= 2
     assert max(map(len, paragraph)) <= width
     assert " ".join(line.rstrip() for line in paragraph) == describe_trust(comparison.sensors)
 

@@ -19,7 +19,6 @@ from egvs.artefacts.run_record import RunRecord
 from egvs.cli import stage_summary
 from egvs.cli.console import (
     LINE_WIDTH,
-    WARNING_LINES,
     Column,
     console,
     make_table,
@@ -55,7 +54,13 @@ _MAX_PERIODS = 4
 
 
 def print_answer(
-    folder: Path, scenario: Scenario, record: RunRecord, *, poles: int | None = None, with_details: bool = False
+    folder: Path,
+    scenario: Scenario,
+    record: RunRecord,
+    *,
+    poles: int | None = None,
+    with_details: bool = False,
+    lines_before: int = 0,
 ) -> None:
     """Print the answer of a finished run: in at most :data:`MAX_LINES` lines, or all that is known.
 
@@ -69,6 +74,8 @@ def print_answer(
         How many of the best poles are listed; None for as many as there is room for, with details for all.
     with_details
         Whether all that is known is printed.
+    lines_before
+        Number of lines with warnings that were printed before.
     """
     run_folder = RunFolder(folder)
     ranked = Ranking.read(run_folder.scores)
@@ -79,10 +86,12 @@ def print_answer(
     elif with_details:
         _print_details(run_folder, ranked, scenario, record, poles)
     else:
-        _print_short(run_folder, ranked, scenario, record, poles)
+        _print_short(run_folder, ranked, scenario, record, poles, MAX_LINES - lines_before)
 
 
-def _print_short(folder: RunFolder, ranked: Ranking, scenario: Scenario, record: RunRecord, poles: int | None) -> None:
+def _print_short(
+    folder: RunFolder, ranked: Ranking, scenario: Scenario, record: RunRecord, poles: int | None, max_lines: int
+) -> None:
     """Print the best site and its lead, the best poles, the worst lane, what was assumed, and where the rest is."""
     best = ranked.best[0]
     has_relief = sites.has_relief(scenario)
@@ -101,7 +110,7 @@ def _print_short(folder: RunFolder, ranked: Ranking, scenario: Scenario, record:
     if assumed := sections.main_assumptions(sections.assumptions(scenario, plans)):
         after += wrap_lines(assumed, 1)
     after.append(f"report: {folder.report} (has everything; --verbose prints it)")
-    room = MAX_LINES - WARNING_LINES - len(before) - len(after) - 1
+    room = max_lines - len(before) - len(after) - 1
     count = poles or min(DEFAULT_POLES, max(MIN_POLES, room))
     out = console(LINE_WIDTH, soft_wrap=False)
     for line in before:

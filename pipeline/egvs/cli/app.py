@@ -122,7 +122,9 @@ def run(
     if verbose:
         run_tables.print_costs(folder, record)
     run_tables.print_audit(record)
-    answer.print_answer(folder, loaded, record, poles=top, with_details=verbose or all_)
+    answer.print_answer(
+        folder, loaded, record, poles=top, with_details=verbose or all_, lines_before=screen.warning_lines
+    )
     if count is not None:
         from egvs.cli.place import place
 
@@ -150,7 +152,7 @@ def demo(
         results, loaded = folder / "results", load(folder)
         screen.flow_source = answer.flow_source(loaded)
         record = run(loaded, results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
-    answer.print_answer(results, loaded, record)
+    answer.print_answer(results, loaded, record, lines_before=screen.warning_lines)
     run_tables.print_demo_hints(results)
 
 

@@ -31,7 +31,7 @@ _UNBROKEN_WIDTH = 100_000
 LINE_WIDTH = 100
 """Width of the lines of an answer in a file."""
 
-WARNING_LINES = 2
+_WARNING_LINES = 2
 """Lines of the most serious warning, unless all details are printed."""
 
 Row = TypeVar("Row")
@@ -181,12 +181,15 @@ class ProgressDisplay:
     ----------
     any_stage_ran
         Whether at least one stage was run or restored from the cache.
+    warning_lines
+        Number of lines that were printed at the end, about warnings.
     flow_source
         What the simulated flows are compared with; set by commands that know the scenario.
     """
 
     def __init__(self, verb: str = "", *, with_details: bool = False, is_run: bool = False) -> None:
         self.any_stage_ran = False
+        self.warning_lines = 0
         self.flow_source = stage_summary.FLOWS
         self._with_details = with_details
         self._is_run = is_run
@@ -214,17 +217,19 @@ class ProgressDisplay:
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         if self._has_bar:
             self._bar.stop()
-        for line in self._warning_lines():
+        lines = list(self._describe_warnings())
+        self.warning_lines = len(lines)
+        for line in lines:
             self.say(line)
         if self._is_run and error is None:
             self.say("")  # before the answer
 
-    def _warning_lines(self) -> Iterator[str]:
+    def _describe_warnings(self) -> Iterator[str]:
         """Yield the most serious of the warnings that were not printed, and how many there are."""
         new = [warning for warning, is_new in self._warnings.items() if is_new]
         if new and not self._with_details:
             count = "1 warning" if len(new) == 1 else f"{len(new)} warnings; the most serious"
-            yield from wrap_lines(f"{count}: {by_severity(new)[0]}", WARNING_LINES)
+            yield from wrap_lines(f"{count}: {by_severity(new)[0]}", _WARNING_LINES)
         if known := len(self._warnings) - len(new):
             yield f"{number_of(known, 'warning')}, as in the run"
 

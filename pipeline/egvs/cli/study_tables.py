@@ -7,6 +7,7 @@ differences of settings.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -156,15 +157,23 @@ def _result_table(comparison: Comparison, runs: Sequence[int], top: int | None, 
 def _pole_columns(comparison: Comparison, runs: Sequence[int], width: int) -> list[Column[ComparedPole]]:
     """Return the best mount of each pole in some runs, and the differences from the first run."""
     columns: list[Column[ComparedPole]] = [Column("pole", lambda pole: pole.name, "left", wrap=True)]
+    has_same_mounts = width < NARROW and all(_is_same_mount(pole) for pole in comparison.poles)
     for run in runs:
-        columns += _mount_columns(comparison, run, width)
+        columns += _mount_columns(comparison, run, width, with_mount=run == 0 or not has_same_mounts)
         if run > 0 and any(pole.differences[run] is not None for pole in comparison.poles):
             title = f"{comparison.runs[run].label} - {comparison.runs[0].label}"
             columns.append(Column(title, partial(_format_gap, run)))
     return columns
 
 
-def _mount_columns(comparison: Comparison, run: int, width: int) -> list[Column[ComparedPole]]:
+def _is_same_mount(pole: ComparedPole) -> bool:
+    """Whether the best mounts of a pole have the same height and tilt in all runs."""
+    return len({None if mount is None else (mount.z_m, mount.pitch_deg) for mount in pole.mounts}) == 1
+
+
+def _mount_columns(
+    comparison: Comparison, run: int, width: int, *, with_mount: bool = True
+) -> list[Column[ComparedPole]]:
     """Return the columns of one run, without those that are the same at all its sites."""
     compared = comparison.runs[run]
     sites = compared.ranking.sites
@@ -180,7 +189,8 @@ def _mount_columns(comparison: Comparison, run: int, width: int) -> list[Column[
 
     is_pitched = any(site.pitch_deg for site in sites)
     if width < NARROW:
-        column("mount", partial(_describe_mount, is_pitched), "left")
+        if with_mount:
+            column("mount", partial(_describe_mount, is_pitched), "left")
     elif any(mount is not None and mount.site != name for mount, name in names):
         column("best site", lambda site: site.site, "left")
     if len(compared.sensors) > 1:
@@ -201,7 +211,9 @@ def _describe_mount(with_pitch: bool, site: RankedSite) -> str:
 
 
 def format_score(site: RankedSite) -> str:
-    """Return the score that ranks with its standard error, e.g. "87.1 % ± 0.5 %"."""
+    """Return the score that ranks with its standard error, e.g. "87.1 ± 0.5 %"; that of other scores is relative."""
+    if site.by.is_share:
+        return site.by.with_error(site.score, math.nan if site.score_se is None else site.score_se)
     error = site.by.error(site.score, site.score_se)
     if error == "-":
         return site.by.value(site.score)

@@ -62,8 +62,8 @@ def describe_joint_score(by: ScoreLabel, sensors: int) -> str:
     if sensors < 2 or by.name not in _INDEPENDENT_SCORES:
         return ""
     return (
-        "Joint shares assume that sensors detect by themselves and miss vehicles independently; near 100 % they are "
-        "upper ends (docs/placement.md)."
+        "Joint shares assume that sensors miss vehicles independently; near 100 % they are upper ends "
+        "(docs/placement.md)."
     )
 
 

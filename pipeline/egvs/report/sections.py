@@ -64,6 +64,10 @@ _BY_IMPORTANCE = ("traffic", "building is known", "surroundings", "positions", "
 """Beginnings of what scenarios assume, that which affects a ranking most first; all other entries follow."""
 
 
+_LONG = 75
+"""Longer lists of assumptions leave out what is in brackets."""
+
+
 def main_assumptions(assumed: Sequence[str], count: int = 2) -> str:
     """Return the assumptions that affect a ranking most, and how many more there are, in one sentence.
 
@@ -75,7 +79,10 @@ def main_assumptions(assumed: Sequence[str], count: int = 2) -> str:
 
     if not assumed:
         return ""
-    return f"Assumed, not measured: {list_first(sorted(assumed, key=order), count, '; ')}."
+    named = list_first(sorted(assumed, key=order), count, "; ")
+    if len(named) > _LONG:
+        named = re.sub(r" \([^)]*\)", "", named)
+    return f"Assumed, not measured: {named}."
 
 
 def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]) -> list[str]:
