@@ -306,6 +306,11 @@ CSV = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\nb,east,a
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all,often"), "line 4: green_s: expected seconds, got 'often'"),
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all"), "line 4: expected 4 values, got 3"),
         ("p.csv", CSV.replace("green_s", "green_s,colour").replace("0\n", "0,red\n"), "unknown column 'colour'"),
+        *(
+            ("p.add.xml", f'<additional><tlLogic id="c"><phase duration="{text}" state="GG"/></tlLogic></additional>',
+             f"invalid <tlLogic> (ValueError(\"duration = '{text}': expected seconds, above 0\"))")
+            for text in ("nan", "-0", "-5", "9223372036854775807")
+        ),
         ("p.add.xml", "<additional/>", "no <tlLogic> with phases for the signal High Street / Mill Lane (c)"),
         ("p.add.xml", '<additional><tlLogic id="c"><phase duration="9" state="GG"/></tlLogic></additional>',
          "expected a state of 20 letters, got 2"),
