@@ -9,9 +9,9 @@ import egvs
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.cli import answer
-from egvs.core.errors import by_severity, collect_warnings
+from egvs.core.errors import collect_warnings
 from egvs.report import ranking_text, sections
-from egvs.report.reliability import describe_reliability
+from egvs.report.reliability import by_severity, describe_reliability
 from egvs.results.plans import SensorPlan
 from egvs.results.ranking import Ranking
 from tests.report.small_runs import PageReader

@@ -12,8 +12,8 @@ from egvs.artefacts.run_record import ResourceUsage, StageRecord
 from egvs.cli import answer
 from egvs.cli.console import ProgressDisplay
 from egvs.cli.stage_summary import describe_summary
-from egvs.core import errors
 from egvs.core.errors import WARNINGS_KEY, Diagnostic
+from egvs.report import reliability
 from egvs.scenario.model import Scenario
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
@@ -66,5 +66,5 @@ def test_warnings_of_unchanged_stages_are_those_of_the_run(capsys: pytest.Captur
 def test_rules_by_severity_exist() -> None:
     """A renamed rule would silently become one of the less serious."""
     source = "".join(path.read_text(encoding="utf-8") for path in Path(egvs.__file__).parent.rglob("*.py"))
-    for rule in {rule for rules in errors._BY_SEVERITY for rule in rules}:
+    for rule in {rule for rules in reliability._BY_SEVERITY for rule in rules}:
         assert re.search(rf'Diagnostic\(\s*"{rule}"', source), rule

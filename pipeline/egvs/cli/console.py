@@ -19,7 +19,7 @@ from rich.text import Text
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.cli import stage_summary
-from egvs.core.errors import Diagnostic, by_severity, collect_warnings, escape_control_characters
+from egvs.core.errors import Diagnostic, collect_warnings, escape_control_characters
 from egvs.core.wording import format_percent, number_of
 
 NARROW, WIDE = 110, 190
@@ -228,6 +228,8 @@ class ProgressDisplay:
         """Yield the most serious of the warnings that were not printed, and how many there are."""
         new = [warning for warning, is_new in self._warnings.items() if is_new]
         if new and not self._with_details:
+            from egvs.report.reliability import by_severity
+
             count = "1 warning" if len(new) == 1 else f"{len(new)} warnings; the most serious"
             yield from wrap_lines(f"{count}: {by_severity(new)[0]}", _WARNING_LINES)
         if known := len(self._warnings) - len(new):

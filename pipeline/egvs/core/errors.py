@@ -161,42 +161,6 @@ def collect_warnings(summaries: Iterable[Mapping[str, Any]]) -> list[Diagnostic]
     return [Diagnostic(**value) for summary in summaries for value in summary.get(WARNINGS_KEY, ())]
 
 
-_BY_SEVERITY = (
-    ("no vehicles",),
-    ("no ranking",),
-    (
-        "overlaps in roi",
-        "overlaps",
-        "traffic through solids",
-        "collisions",
-        "waiting",
-        "standing",
-        "teleports",
-        "jumps",
-    ),
-    ("sites on lanes", "blocked sites", "measured scan", "vehicles off their lanes", "vehicles against lanes"),
-    (
-        "mesh units",
-        "mesh axes",
-        "few beams",
-        "beam angles",
-        "blind sites",
-        "map as network",
-        "relief",
-        "track alignment",
-    ),
-)
-"""Rules of warnings that make a result worthless, that tell of traffic that cannot be, of sites where no sensor can
-stand, and of scenes that are not as they are in reality; all other warnings are less serious."""
-
-
-def by_severity(warnings: Iterable[Diagnostic]) -> list[Diagnostic]:
-    """Return different warnings, the most serious first; equally serious ones in their order."""
-    order = {rule: number for number, rules in enumerate(_BY_SEVERITY) for rule in rules}
-    distinct = dict.fromkeys(warnings)
-    return sorted(distinct, key=lambda warning: order.get(warning.rule, len(_BY_SEVERITY)))
-
-
 def with_relative_paths(folder: Path, summary: dict[str, Any]) -> dict[str, Any]:
     """Return a stage's summary with the files in its warnings relative to the scenario's folder.
 

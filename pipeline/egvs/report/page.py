@@ -23,7 +23,7 @@ from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord, traffic_summary
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
-from egvs.core.errors import WARNINGS_KEY, by_severity, collect_warnings
+from egvs.core.errors import WARNINGS_KEY, collect_warnings
 from egvs.drawing import maps, pages
 from egvs.drawing import run_figures as figures
 from egvs.drawing.basemap import network_file
@@ -47,7 +47,7 @@ from egvs.report.ranking_text import (
     recorded_frames_hint,
     short_lead,
 )
-from egvs.report.reliability import describe_reliability
+from egvs.report.reliability import by_severity, describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
     assumes_flows,
