@@ -48,7 +48,7 @@ def test_runs_each_sensor_and_prints_what_compare_prints_for_these_runs(here: Pa
     assert lines[-1].endswith(f"runs/{other}")
     compared = run_egvs("compare", f"runs/{own}", f"runs/{other}")[1]
     assert without_costs_hint(printed) == without_costs_hint(compared)
-    assert "egvs compare mini --sensors small,VLP-16 --set 'costs.sensor={" in printed
+    assert "With costs: --set 'costs.sensor={" in printed
 
     again = run_egvs("compare", "mini", "--sensors", "small,VLP-16")
     assert again[1] == printed
