@@ -56,7 +56,7 @@ def test_tables_of_data_have_a_file_and_a_link(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for name in re.findall(r"<!-- data table (\S+) -->", text):
         file = DOCS / "data" / f"{name}.csv"
-        assert f"({os.path.relpath(file, page.parent)})" in text
+        assert f"({Path(os.path.relpath(file, page.parent)).as_posix()})" in text
         table = file.read_text(encoding="utf-8")
         assert not {target: reason for target in links(table) if (reason := problem(page, target))}
 
