@@ -248,6 +248,28 @@ def test_signal_of_several_junctions_knows_its_foes(tmp_path):
         assert not any(link.foes & green for link in signal.links if link.index in green)
 
 
+def test_approach_may_stay_red(crossing, tmp_path):
+    """Named without movements, in the scenario or in a table; a phase without any is red for all vehicles."""
+    closed = {
+        "phases": [NS | {"green": {"north": ["all"], "south": ["all"], "east": [], "west": []}}, EW | {"green": {}}]
+    }
+    (program,) = programs(crossing, {"c": closed}).values()
+    shutil.copy(crossing / "net.net.xml", tmp_path)
+    rows = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\na,east,,30\na,west,,30\nb,,,20\n"
+    (tmp_path / "p.csv").write_text(rows)
+    (from_table,) = programs(tmp_path, {"c": {"file": "p.csv"}}).values()
+    assert from_table == program
+    (signal,) = signals.read_signals(crossing / "net.net.xml", network.read_net_xml(crossing / "net.net.xml"))
+    closed_links = {
+        link.index for link in signal.links if link.side in ("east", "west") and link.movement != "crosswalk"
+    }
+    for phase in program.phases:
+        assert all(phase.state[index] == "r" for index in closed_links)
+    vehicles = [link.index for link in signal.links if link.movement != "crosswalk"]
+    assert {program.phases[3].state[index] for index in vehicles} == {"r"}
+    assert {letter for index, letter in enumerate(program.phases[3].state) if index not in vehicles} == {"G"}
+
+
 WRONG = [
     ({"x": {"phases": [NS, EW]}}, r"traffic.signals.x: the network has no such signal. Its signals are: High Street"),
     ({"c": {"phases": [NS, EW | {"green": {"nrth": ["all"]}}]}},
@@ -262,7 +284,7 @@ WRONG = [
     ({"c": {"phases": [NS | {"green": {"north": ["straight", "crossing"]}}]}},
      r"Mill Lane \(north\) straight and Mill Lane \(north\) crosswalk conflict"),
     ({"c": {"phases": [NS]}}, r"never green: High Street \(east\) right, High Street \(east\) straight.*\. "
-     r"A plan replaces all phases of the signal: add these movements to a phase\."),
+     r"Add these movements to a phase, or name their approach without movements if it stays red\."),
     ({"c": {"phases": [NS, EW], "cycle_s": 90}},
      r"cycle_s = 90: the phases with yellow and all-red add up to 60 s \(30, 3, 2, 20, 3, 2\). Use cycle_s = 60"),
     ({"c": {"phases": [NS, EW]}, "Mill Lane": {"phases": [NS, EW]}}, r"High Street / Mill Lane \(c\) has two plans"),
@@ -285,7 +307,6 @@ def test_rejects_plans_that_do_not_fit(crossing, plans, message):
         ({"phases": [NS | {"max_green_s": 40}]}, 'max_green_s has no effect with a fixed plan. Set type = "actuated"'),
         ({"phases": [NS | {"min_green_s": 40}], "type": "actuated"}, "expected min_green_s up to max_green_s"),
         ({"file": "a.add.xml", "yellow_s": 4}, "yellow_s has no effect with a <tlLogic> file"),
-        ({"phases": [NS | {"green": {}}]}, "at least 1"),
     ],
 )
 def test_rejects_contradictory_keys(plan, message):

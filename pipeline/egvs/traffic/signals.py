@@ -30,6 +30,9 @@ GREEN_LETTERS = frozenset("Gg")
 YELLOW_LETTERS = frozenset("yY")
 
 CROSSING = "crosswalk"
+INSIDE = "inside"
+"""Mark in the name of a street between two nodes of a signal, which is no approach of its junction."""
+
 MOVEMENTS = ("left", "straight", "right", U_TURN, CROSSING)
 
 _PROGRAM = re.compile(r"    <tlLogic id=(\"[^\"]*\").*?</tlLogic>\n", re.DOTALL)
@@ -48,13 +51,16 @@ class Link:
     movement
         One of :data:`MOVEMENTS`.
     edge, street
-        Edge of the approach, and its street; empty for a crossing, and for a street without a name.
+        Edge of the approach, and its street; empty for a crossing, and for a street without a name or inside the
+        junction.
     heading
         Direction in which vehicles arrive, (2,); None for a crossing.
     foes, yields_to
         Positions of the links that conflict with it, and of those that it gives way to.
     side
-        Side of the junction where the approach lies.
+        Side of the junction where the approach lies; empty for a street inside the junction.
+    target
+        Edge to which it leads; empty for a crossing.
     """
 
     index: int
@@ -66,6 +72,7 @@ class Link:
     foes: frozenset[int] = frozenset()
     yields_to: frozenset[int] = frozenset()
     side: str = ""
+    target: str = ""
 
     @property
     def title(self) -> str:
@@ -274,8 +281,11 @@ def _read_signal(
         keys.append(key)
 
     incoming = sorted({connection["from"] for connection in connections if not connection["from"].startswith(":")})
-    titles = disambiguate_approaches([approaches.approach(edge) for edge in incoming], incoming)
-    names = dict(zip(incoming, titles, strict=True))
+    inside = [edge for edge in incoming if any(edge == connection["to"] for connection in connections)]
+    outside = [edge for edge in incoming if edge not in inside]
+    titles = disambiguate_approaches([approaches.approach(edge) for edge in outside], outside)
+    titles += disambiguate_approaches([f"{approaches.approach(edge)} {INSIDE}" for edge in inside], inside)
+    names = dict(zip([*outside, *inside], titles, strict=True))
     links = []
     for connection, (node, number) in zip(connections, keys, strict=True):
         request = next((each for each in parts.requests[node] if int(each["index"]) == number), {})
@@ -287,8 +297,9 @@ def _read_signal(
         index = int(connection["linkIndex"])
         if start in names:
             movement = TURNS.get(connection.get("dir", ""), "straight")
-            street, heading, side = approaches.street(start), approaches.heading(start), approaches.side(start)
-            link = Link(index, names[start], movement, start, street, heading, foes, yields_to, side)
+            heading = approaches.heading(start)
+            street, side = ("", "") if start in inside else (approaches.street(start), approaches.side(start))
+            link = Link(index, names[start], movement, start, street, heading, foes, yields_to, side, connection["to"])
         else:
             arm = approaches.crossed_arm(connection["to"])
             link = Link(index, names.get(arm.edge, arm.name), CROSSING, "", "", None, foes, yields_to, arm.side)
