@@ -222,6 +222,23 @@ def test_movements_with_equal_green_share_an_entry():
     )
 
 
+def test_actuated_greens_are_at_most_the_longest():
+    """netconvert writes a duration of 82 s beside a limit of 50 s: no green is longer than the cycle."""
+    link = signals.Link(0, "north", "straight", "a", "", np.array([0.0, -1.0]))
+    phases = (signals.Phase(82.0, "G", 5.0, 50.0), signals.Phase(3.0, "y"), signals.Phase(5.0, "r"))
+    program = signals.Program("actuated", 0.0, phases)
+    signal = signals.Signal("c", ("c",), (0.0, 0.0), (link,), program)
+    region = Roi((-1.0, -1.0, 0.0), (2.0, 2.0, 1.0))
+    (plan,) = signal_descriptions.describe_signals([signal], region, {}, "assumed")
+    assert signal_descriptions.format_plan(plan) == (
+        "Signals at c (assumed): actuated, cycle up to 58 s; green up to 50 s north."
+    )
+    (fixed,) = signal_descriptions.describe_signals(
+        [replace(signal, program=replace(program, type="static"))], region, {}, "assumed"
+    )
+    assert signal_descriptions.format_plan(fixed) == "Signals at c (assumed): fixed, cycle 90 s; green 82 s north."
+
+
 def test_plan_of_the_network_is_described_only_in_the_region(crossing):
     found = signals.read_signals(crossing / "net.net.xml", network.read_net_xml(crossing / "net.net.xml"))
     here, elsewhere = (

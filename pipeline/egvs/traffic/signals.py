@@ -129,9 +129,16 @@ class Program:
         return cls(element.get("type", "static"), float(element.get("offset", "0")), tuple(phases), clock, params)
 
     @property
+    def longest_s(self) -> tuple[float, ...]:
+        """Duration of each phase; of actuated signals, the longest one."""
+        if self.type == "static":
+            return tuple(phase.duration_s for phase in self.phases)
+        return tuple(phase.duration_s if phase.max_s is None else phase.max_s for phase in self.phases)
+
+    @property
     def cycle_s(self) -> float:
-        """Sum of the durations of the phases."""
-        return sum(phase.duration_s for phase in self.phases)
+        """Duration of the cycle; of actuated signals, the longest one."""
+        return sum(self.longest_s)
 
     def to_xml(self, name: str) -> str:
         """Return the ``<tlLogic>`` as netconvert writes it."""
