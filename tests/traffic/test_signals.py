@@ -401,6 +401,23 @@ def test_u_turn_has_one_printed_name(word):
     assert [row["movements"] for row in plan["rows"]] == [["U-turn"]]
 
 
+def test_approach_is_found_by_another_street_that_leads_to_it():
+    links = [
+        signals.Link(0, "High Street (west)", "straight", "a", "High Street", np.array([1.0, 0.0]), side="west",
+                     aliases=("Back Lane",)),
+        signals.Link(1, "Back Lane (north)", "left", "b", "Back Lane", np.array([0.0, -1.0]), side="north"),
+    ]  # fmt: skip
+    signal = signals.Signal("c", ("c",), (0.0, 0.0), tuple(links), signals.Program("static", 0.0, ()))
+    for name, approach in (
+        ("back ln. (west)", "High Street (west)"),
+        ("Back Lane", "Back Lane (north)"),
+        ("W", "High"),
+    ):
+        phase = SignalPhaseConfig.from_dict({"green": {name: ["all"]}, "green_s": 20})
+        (index,) = signal_plans._green_links(phase, signal, "plan")
+        assert links[index].approach.startswith(approach)
+
+
 def test_long_ids_are_shortened_and_still_accepted(tmp_path):
     """SUMO's id of joined nodes is cut after 19 characters in messages; both spellings find the signal."""
     name = "cluster_1423165998_1698047149_31384678"

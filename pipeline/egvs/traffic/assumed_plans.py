@@ -2,7 +2,8 @@
 
 Approaches that do not conflict have green together, as opposite ones do. Where a signal governs several nodes, such as
 those of the two carriageways of a main road, the streets between them have green with the approaches that lead to them,
-so that vehicles do not stop inside the junction. Then come the movements that still have no green.
+so that vehicles do not stop inside the junction. Then come the movements that still have no green. Left turns give way
+to oncoming traffic: phases of their own cost more time than they save at usual flows.
 
 The signals are actuated: greens end early where nobody arrives, and are so long that nobody waits longer than
 :data:`CYCLE_S`.
@@ -24,14 +25,11 @@ CYCLE_S = 120.0
 """Longest cycle."""
 
 MAX_GREEN_S = 50.0
-LEFT_GREEN_S = 15.0
-"""Longest green of left turns alone, and of people on a crossing that no other green serves."""
+SHORT_GREEN_S = 15.0
+"""Longest green of single movements, and of people on crossings that no other green serves."""
 
 CHANGE_S = 5.0
 """Yellow and all-red between two greens."""
-
-_ONCOMING_LANES = 2
-"""Left turns across this number of lanes get some seconds without oncoming traffic."""
 
 Movement = tuple[str, str]
 
@@ -46,10 +44,10 @@ def assumed_plan(signal: Signal) -> SignalConfig:
     """
     stages = _stages(signal)
     is_short = [short for _, short in stages]
-    long_s = (CYCLE_S - CHANGE_S * len(stages) - LEFT_GREEN_S * sum(is_short)) / max(1, is_short.count(False))
+    long_s = (CYCLE_S - CHANGE_S * len(stages) - SHORT_GREEN_S * sum(is_short)) / max(1, is_short.count(False))
     long_s = float(max(DEFAULT_MIN_GREEN_S, min(MAX_GREEN_S, math.floor(long_s))))
     phases = [
-        SignalPhaseConfig(green=_by_approach(stage), green_s=LEFT_GREEN_S if short else long_s)
+        SignalPhaseConfig(green=_by_approach(stage), green_s=SHORT_GREEN_S if short else long_s)
         for stage, short in stages
     ]
     return SignalConfig(type="actuated", phases=tuple(phases))
@@ -104,16 +102,6 @@ class _Movements:
                 whole.append(movement)
         return whole
 
-    def crosses_lanes(self, movement: Movement, stage: Iterable[Movement]) -> bool:
-        """Return whether a turn gives way to several lanes of oncoming traffic in a stage."""
-        straight = {link.index for each in stage if each[1] == "straight" for link in self.links[each]}
-        return any(len(link.yields_to & straight) >= _ONCOMING_LANES for link in self.links[movement])
-
-    def is_free(self, movement: Movement, others: Iterable[Movement]) -> bool:
-        """Return whether a movement has no conflict with others, not even with one that gives way."""
-        foes = {index for other in others for link in self.links[other] for index in link.foes}
-        return not any(link.index in foes for link in self.links[movement])
-
     def cosine(self, approach: str, other: str) -> float:
         """Return the cosine of the angle between two approaches, -1 for opposite ones."""
         headings = [self._heading(name) for name in (approach, other)]
@@ -144,18 +132,10 @@ def _stages(signal: Signal) -> list[tuple[list[Movement], bool]]:
         if _is_served(stage, others):
             stages = others
 
-    waiting = [
-        movement
-        for movement in movements.vehicles
-        if not any(movement in stage and not movements.crosses_lanes(movement, stage) for stage in stages)
+    phases = [
+        (stage, not any(_is_served(movements.of_approach(name), [stage]) for name in movements.outer))
+        for stage in stages
     ]
-    phases: list[tuple[list[Movement], bool]] = []
-    for stage in stages:
-        phases.append((stage, not any(_is_served(movements.of_approach(name), [stage]) for name in movements.outer)))
-        turning = [movement for movement in waiting if movement in stage]
-        if turning:
-            waiting = [movement for movement in waiting if movement not in turning]
-            phases.append(([movement for movement in stage if movements.is_free(movement, turning)], True))
     vehicles = [[link for movement in phase for link in movements.links[movement]] for phase, _ in phases]
     people = [link for link in signal.links if link.movement == CROSSING]
     is_always_green = len(phases) == 1

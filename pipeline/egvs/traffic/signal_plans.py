@@ -209,6 +209,9 @@ def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str, stated: S
             selected = [link for link in on_approach if requested in (_ALL, link.movement)]
             if requested == _ALL:
                 selected = [link for link in selected if link.movement != CROSSING]
+            if not selected:  # vehicles drive straight on first, and turn behind a street inside the junction
+                turning = {link.edge for link in signal.links if link.movement == requested}
+                selected = [link for link in on_approach if link.target in turning]
             if not selected:
                 known = ", ".join(dict.fromkeys(link.movement for link in on_approach))
                 problem = f"approach {approach!r} has no movement {movement!r}"
@@ -235,17 +238,22 @@ def _gives_way_to_people(link: Link, crossing: Link) -> bool:
 
 
 def _links_of_approach(approach: str, signal: Signal, where: str) -> list[Link]:
+    """Return the links of the approach of this name: the full name, else one of its parts, else that of an alias."""
     side = parse_side(approach)
-    street = normalise_street(approach)
-    matches = list(dict.fromkeys(link.approach for link in signal.links if street == normalise_street(link.approach)))
-    is_exact = bool(matches)
-    for link in signal.links:
-        names = {normalise_street(link.street), normalise_street(link.edge)} - {""}
-        if link.side and link.street:
-            names |= approach_spellings(link.side, link.street)
-        is_meant = street in names or (side is not None and side == link.side)
-        if is_meant and not is_exact and link.approach not in matches:
-            matches.append(link.approach)
+    name = normalise_street(approach)
+
+    def is_full_name(link: Link) -> bool:
+        return name in (normalise_street(link.approach), normalise_street(link.edge))
+
+    def is_part(link: Link) -> bool:
+        return (side is not None and side == link.side) or name in _spellings(link, link.street)
+
+    def is_alias(link: Link) -> bool:
+        return any(name in _spellings(link, street) for street in link.aliases)
+
+    matches: list[str] = []
+    for is_meant in (is_full_name, is_part, is_alias):
+        matches = matches or list(dict.fromkeys(link.approach for link in signal.links if is_meant(link)))
     known = "; ".join(f"{name} ({', '.join(movements)})" for name, movements in signal.approaches.items())
     if not matches:
         raise InputError(
@@ -255,6 +263,13 @@ def _links_of_approach(approach: str, signal: Signal, where: str) -> list[Link]:
         problem = f"approach {approach!r} may be {' or '.join(map(repr, matches))}"
         raise InputError(where, problem, "Use the full name.")
     return [link for link in signal.links if link.approach == matches[0]]
+
+
+def _spellings(link: Link, street: str) -> frozenset[str]:
+    """Return what a user may write for the approach of a link on a street."""
+    if not street:
+        return frozenset()
+    return frozenset({normalise_street(street)}) | (approach_spellings(link.side, street) if link.side else frozenset())
 
 
 def _check_conflicts(green: set[int], signal: Signal, where: str) -> None:

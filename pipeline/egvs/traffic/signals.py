@@ -30,9 +30,6 @@ GREEN_LETTERS = frozenset("Gg")
 YELLOW_LETTERS = frozenset("yY")
 
 CROSSING = "crosswalk"
-INSIDE = "inside"
-"""Mark in the name of a street between two nodes of a signal, which is no approach of its junction."""
-
 MOVEMENTS = ("left", "straight", "right", U_TURN, CROSSING)
 
 _PROGRAM = re.compile(r"    <tlLogic id=(\"[^\"]*\").*?</tlLogic>\n", re.DOTALL)
@@ -61,6 +58,8 @@ class Link:
         Side of the junction where the approach lies; empty for a street inside the junction.
     target
         Edge to which it leads; empty for a crossing.
+    aliases
+        Other streets that lead to the approach.
     """
 
     index: int
@@ -73,6 +72,7 @@ class Link:
     yields_to: frozenset[int] = frozenset()
     side: str = ""
     target: str = ""
+    aliases: tuple[str, ...] = ()
 
     @property
     def title(self) -> str:
@@ -288,11 +288,8 @@ def _read_signal(
         keys.append(key)
 
     incoming = sorted({connection["from"] for connection in connections if not connection["from"].startswith(":")})
-    inside = [edge for edge in incoming if any(edge == connection["to"] for connection in connections)]
-    outside = [edge for edge in incoming if edge not in inside]
-    titles = disambiguate_approaches([approaches.approach(edge) for edge in outside], outside)
-    titles += disambiguate_approaches([f"{approaches.approach(edge)} {INSIDE}" for edge in inside], inside)
-    names = dict(zip([*outside, *inside], titles, strict=True))
+    titles = disambiguate_approaches([approaches.approach(edge) for edge in incoming], incoming)
+    names = dict(zip(incoming, titles, strict=True))
     links = []
     for connection, (node, number) in zip(connections, keys, strict=True):
         request = next((each for each in parts.requests[node] if int(each["index"]) == number), {})
@@ -304,9 +301,11 @@ def _read_signal(
         index = int(connection["linkIndex"])
         if start in names:
             movement = TURNS.get(connection.get("dir", ""), "straight")
-            heading = approaches.heading(start)
-            street, side = ("", "") if start in inside else (approaches.street(start), approaches.side(start))
-            link = Link(index, names[start], movement, start, street, heading, foes, yields_to, side, connection["to"])
+            heading, target = approaches.heading(start), connection["to"]
+            street, side, aliases = approaches.street(start), approaches.side(start), approaches.aliases(start)
+            if approaches.is_inside(start):
+                street, side, aliases = "", "", ()
+            link = Link(index, names[start], movement, start, street, heading, foes, yields_to, side, target, aliases)
         else:
             arm = approaches.crossed_arm(connection["to"])
             link = Link(index, names.get(arm.edge, arm.name), CROSSING, "", "", None, foes, yields_to, arm.side)
