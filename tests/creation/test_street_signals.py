@@ -6,13 +6,17 @@ from pathlib import Path
 
 import pytest
 
+from egvs.creation import junctions
+from egvs.creation.junction_zones import junction_zones
 from egvs.creation.openstreetmap import street_network
 from egvs.creation.openstreetmap.street_network import StreetNetwork
 from egvs.creation.openstreetmap.street_signals import number_crossings
 from egvs.formats import osm
 from egvs.scenario.signal_config import SignalConfig
 from egvs.traffic import signals
+from egvs.traffic.approaches import ApproachIndex
 from egvs.traffic.assumed_plans import CYCLE_S
+from egvs.traffic.movements import MovementNames
 from egvs.traffic.signal_plans import agree, make_program
 from egvs.traffic.signals import Signal
 from tests.creation.small_maps import XY, street, write_map
@@ -75,10 +79,19 @@ def check_program(signal: Signal) -> None:
 
 @pytest.mark.parametrize(("walk", "gap_m", "number"), [(False, 24.0, 1), (False, WIDE_M, 2), (True, WIDE_M, 2)])
 def test_signals_at_stop_lines_become_one_signal(tmp_path: Path, walk: bool, gap_m: float, number: int) -> None:
-    (signal,) = read_signals(tmp_path, build(tmp_path, AT_STOP_LINES, walk=walk, gap_m=gap_m))
+    made = build(tmp_path, AT_STOP_LINES, walk=walk, gap_m=gap_m)
+    (signal,) = read_signals(tmp_path, made)
     assert len(signal.nodes) == number
     assert {link.approach for link in signal.links if link.side} == OUTER
     check_program(signal)
+    (junction,) = [each for each in made.streets.junctions if each.signalised]
+    assert (junction.nodes, junction.arms, junction.lanes_in) == (signal.nodes, 4, 6)
+    flows = junctions.assumed_flows(made.streets, junctions.region_around(junction))
+    names = MovementNames(made.streets.network, junction.at_m, flows)
+    assert set(ApproachIndex.of_flows(flows, names).titles) == OUTER
+    assert {zone.name for zone in junction_zones(made.streets, junction, junctions.region_around(junction))} >= {
+        f"{name} stop line" for name in OUTER
+    }
     together = [
         {link.approach for link in signal.links if phase.state[link.index] in "Gg" and link.movement == "straight"}
         for phase in signal.program.phases

@@ -114,7 +114,8 @@ def find_signals(graph: StreetGraph) -> MapSignals:
     """Find the junctions of a network that signals of the map govern.
 
     A junction of three or more streets has signals if netconvert gave it some, or if the map has signals on at least
-    half of its approaches, and on two or more. Signalised nodes near each other are one junction.
+    half of its approaches, and on two or more. Signalised nodes near each other are one junction, except those
+    of a roundabout.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def find_signals(graph: StreetGraph) -> MapSignals:
     near = sorted((length_m, *pair) for pair, length_m in distances_m.items() if length_m <= SAME_JUNCTION_M)
     junctions = {node: {node} for node in governed}
     for _, node, other in near:
-        if governed.issuperset((node, other)):
+        if governed.issuperset((node, other)) and not (graph.is_on_ring(node) or graph.is_on_ring(other)):
             joined = junctions[node] | junctions[other]
             if max(distances_m[pair] for pair in distances_m if joined.issuperset(pair)) <= LARGEST_M:
                 junctions |= dict.fromkeys(joined, joined)

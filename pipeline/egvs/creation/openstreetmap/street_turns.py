@@ -363,6 +363,11 @@ class StreetGraph:
                 ends.setdefault(edge.to_node, []).append(self._xy(self.end_node(edge.steps[-1])))
         return {node: (fmean(x for x, _ in points), fmean(y for _, y in points)) for node, points in ends.items()}
 
+    def is_on_ring(self, node: str) -> bool:
+        """Return whether a node of the network is on a roundabout of the map."""
+        last = [edge.steps[-1] for edge in self.edges.values() if edge.to_node == node]
+        return any(self._ways[step.way].tags.get("junction") in _RINGS for step in last)
+
     def has_signal(self, node: int) -> bool:
         """Return whether a node of the map has a traffic signal."""
         return is_signal(self._extract.node_tags.get(node, {}))
