@@ -376,12 +376,13 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 def test_real_town(town: Made) -> None:
     folder, summary = town
-    assert "Meisebacher Straße" in summary.junction.title and summary.junction.signalised
+    assert "Seilerweg" in summary.junction.title and summary.junction.signalised
+    assert len(summary.junction.nodes) == 3  # they have one signal
     assert isinstance(summary.traffic, AssumedTraffic) and summary.traffic.assumed_per_h > 1000
-    assert summary.statics.counts.heights["building"] == {"levels": 1, "default": 262}
-    assert summary.statics.counts.objects["tree_trunk"] == 10
-    assert summary.statics.counts.dropped["out_of_range"] == {"barrier": 2, "building": 379, "pole": 18, "tree": 5}
-    assert loading.load(folder).roi.grid.shape == (360, 320, 20)
+    assert summary.statics.counts.heights["building"] == {"levels": 4, "default": 162}
+    assert summary.statics.counts.objects["tree_trunk"] == 0
+    assert summary.statics.counts.dropped["out_of_range"] == {"barrier": 5, "building": 476, "pole": 15, "tree": 15}
+    assert loading.load(folder).roi.grid.shape == (280, 440, 20)
     check_sites(folder, 12)
 
 
@@ -535,7 +536,7 @@ def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: 
         f"carries at least {traffic.assumed_per_h:,} vehicles an hour; {level} {100 * share:.0f} % is used"
     )
     text = (tmp_path / "out" / "scenario.toml").read_text(encoding="utf-8")
-    assert f"the network {traffic.summary}. Replace them by real counts" in text
+    assert f"the network {traffic.summary}. Replace its numbers by real counts" in text
     loaded = loading.load(tmp_path / "out")
     assert (loaded.traffic.junction_blocker_s, loaded.traffic.teleport_s) == (10.0, 120.0)
 

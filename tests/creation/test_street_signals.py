@@ -1,24 +1,30 @@
 """Signals of a map: one for each junction on the ground, with a plan that serves all of its movements."""
 
 import re
+import shutil
 from itertools import combinations
 from pathlib import Path
 
 import pytest
 
+from egvs.core.errors import InputError
 from egvs.creation import junctions
 from egvs.creation.junction_zones import junction_zones
 from egvs.creation.openstreetmap import street_network
 from egvs.creation.openstreetmap.street_network import StreetNetwork
 from egvs.creation.openstreetmap.street_signals import number_crossings
 from egvs.formats import osm
+from egvs.scenario.loading import load
 from egvs.scenario.signal_config import SignalConfig
 from egvs.traffic import signals
 from egvs.traffic.approaches import ApproachIndex
 from egvs.traffic.assumed_plans import CYCLE_S
 from egvs.traffic.movements import MovementNames
-from egvs.traffic.signal_plans import agree, make_program
+from egvs.traffic.network import read_net_xml
+from egvs.traffic.signal_descriptions import describe_simulated
+from egvs.traffic.signal_plans import agree, apply_plans, make_program
 from egvs.traffic.signals import Signal
+from tests.creation.new_scenarios import create_scenario
 from tests.creation.small_maps import XY, street, write_map
 
 pytestmark = pytest.mark.system
@@ -174,3 +180,65 @@ def test_real_junctions_have_one_signal(
     outer = {link.edge for link in here.links} - targets
     lanes = {edge.id: edge.lanes_for("passenger") for edge in made.streets.network.edges}
     assert sum(lanes[edge] for edge in outer) == lanes_in
+
+
+@pytest.fixture(scope="module")
+def made_scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("new")
+    write_map(folder / "map.osm", nodes(), WAYS, AT_STOP_LINES)
+    create_scenario(folder / "made", folder / "map.osm", righthand=True)
+    return folder / "made"
+
+
+def test_untouched_tables_change_nothing(made_scenario: Path, tmp_path: Path) -> None:
+    """The counts are those that were assumed, and the plan is that of the network."""
+    scenario = load(made_scenario)
+    (signal,) = scenario.traffic.signals
+    assert signal.startswith("signal_")
+    network = made_scenario / "network.net.xml"
+    shutil.copy(network, tmp_path)
+    apply_plans(scenario, tmp_path / network.name, network)
+    assert (tmp_path / network.name).read_text() == network.read_text()
+    (plan,) = describe_simulated(scenario, network, read_net_xml(network))
+    assert plan["source"] == "assumed"
+    assert all(count.per_hour == round(count.per_hour) > 0 for count in scenario.traffic.counts)
+    assert any("traffic" in entry for entry in scenario.assumed)
+
+
+def test_edited_tables_are_used_and_stay(made_scenario: Path, tmp_path: Path) -> None:
+    shutil.copytree(made_scenario, tmp_path / "made")
+    counts, signals_table = tmp_path / "made" / "counts.csv", tmp_path / "made" / "signals.csv"
+    header, first, *rest = counts.read_text().splitlines()
+    edited = ";".join([*first.split(",")[:-1], "1234,5"])
+    counts.write_text("\n".join([header.replace(",", ";"), edited, *(row.replace(",", ";") for row in rest)]) + "\n")
+    signals_table.write_text(re.sub(r",\d+$", ",17", signals_table.read_text(), flags=re.MULTILINE))
+    scenario = load(tmp_path / "made")
+    assert scenario.traffic.counts[0].per_hour == 1234.5
+    assert scenario.traffic.counts[1:] == load(made_scenario).traffic.counts[1:]
+    network = tmp_path / "made" / "network.net.xml"
+    apply_plans(scenario, network, network)
+    (plan,) = describe_simulated(scenario, network, read_net_xml(network))
+    assert (plan["source"], plan["cycle_s"]) == ("signals.csv", 2 * (17 + 5))
+    with pytest.raises(InputError, match="not empty"):
+        create_scenario(tmp_path / "made", tmp_path / "map.osm", righthand=True)
+    assert "1234,5" in counts.read_text()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("approach,turn,count\nRing (west),left,5\n", "line 2: expected from_edge and to_edge, or edge, got neither"),
+        ("from_edge,to_edge,count\na,b,many\n", "line 2: count: expected vehicles per hour, got 'many'"),
+        ("from_edge,to_edge\na,b\n", "the column 'count' is missing"),
+        ("from_edge,to_edge,count,colour\na,b,3,red\n", "unknown column 'colour'"),
+        (None, "traffic.counts: no such file"),
+    ],
+)
+def test_rejects_tables_of_counts(made_scenario: Path, tmp_path: Path, content: str | None, message: str) -> None:
+    shutil.copytree(made_scenario, tmp_path / "made")
+    table = tmp_path / "made" / "counts.csv"
+    table.unlink()
+    if content is not None:
+        table.write_text(content)
+    with pytest.raises(InputError, match=message):
+        load(tmp_path / "made")

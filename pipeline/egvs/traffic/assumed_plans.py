@@ -18,7 +18,7 @@ import numpy as np
 
 from egvs.scenario.signal_config import DEFAULT_MIN_GREEN_S, SignalConfig, SignalPhaseConfig
 from egvs.traffic.directions import Floats
-from egvs.traffic.signal_plans import agree
+from egvs.traffic.signal_plans import agree, make_program
 from egvs.traffic.signals import CROSSING, Link, Signal
 
 CYCLE_S = 120.0
@@ -51,6 +51,14 @@ def assumed_plan(signal: Signal) -> SignalConfig:
         for stage, short in stages
     ]
     return SignalConfig(type="actuated", phases=tuple(phases))
+
+
+def is_assumed(signal: Signal) -> bool:
+    """Return whether the program of a signal is the assumed plan."""
+    program = signal.program
+    if program.type != "actuated" or program.params or program.clock is not None:
+        return False
+    return program == make_program(assumed_plan(signal), signal, signal.title)
 
 
 class _Movements:

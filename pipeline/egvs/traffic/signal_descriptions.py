@@ -10,6 +10,7 @@ from egvs.core.grid import Roi
 from egvs.core.wording import shorten_id
 from egvs.scenario.model import Scenario
 from egvs.traffic import network
+from egvs.traffic.assumed_plans import is_assumed
 from egvs.traffic.directions import CLOCKWISE, COMPASS
 from egvs.traffic.signal_plans import find_signal
 from egvs.traffic.signals import (
@@ -37,9 +38,9 @@ def describe_simulated(scenario: Scenario, path: Path, roads: network.Network) -
     planned = {}
     for name, config in scenario.traffic.signals.items():
         signal = find_signal(name, found, f"{scenario.file}: traffic.signals.{name}")
-        planned[signal.id] = config.file or "from the scenario"
-    is_assumed = any("signal" in entry for entry in scenario.assumed)
-    return describe_signals(found, scenario.roi.box, planned, ASSUMED_SOURCE if is_assumed else "from the network")
+        planned[signal.id] = ASSUMED_SOURCE if is_assumed(signal) else config.file or "from the scenario"
+    assumes_plans = any("signal" in entry for entry in scenario.assumed)
+    return describe_signals(found, scenario.roi.box, planned, ASSUMED_SOURCE if assumes_plans else "from the network")
 
 
 def describe_signals(
