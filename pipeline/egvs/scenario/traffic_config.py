@@ -85,14 +85,12 @@ _PERIOD_SOURCES = ("sumocfg", "fcd", "tracks")
 Tracks = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)]
 
 
-Counts = Annotated[
-    tuple[CountConfig, ...],
-    Field(
-        json_schema_extra=lambda schema: schema.update(
-            type=["array", "string"], description=f"{schema['description']}. Rows, or the name of a CSV table of them"
-        )
-    ),
-]
+def _allow_table(schema: dict[str, Any]) -> None:
+    schema["type"] = ["array", "string"]
+
+
+Counts = Annotated[tuple[CountConfig, ...], Field(json_schema_extra=_allow_table)]
+"""A scenario file may name a CSV table instead of the rows, which is read with it."""
 
 
 class PeriodConfig(StrictModel):
@@ -104,7 +102,7 @@ class PeriodConfig(StrictModel):
     fcd: str | None = Field(None, description="Finished FCD file of this period")
     tracks: Tracks | None = Field(None, description="Files of recorded tracks of this period")
     routes: tuple[str, ...] = Field((), description="Route files of this period")
-    counts: Counts = Field((), description="Traffic counts of this period")
+    counts: Counts = Field((), description="Traffic counts of this period, in rows or in a CSV table")
     vehicles: int | None = Field(None, ge=1, description="Number of vehicles in the network in this period")
     begin_s: float | None = Field(None, ge=0, description="As traffic.begin_s")
     length_s: Positive | None = Field(None, description="Duration of the recording, instead of traffic.frames")
@@ -385,7 +383,9 @@ class TrafficConfig(StrictModel):
         " between them. By default, those of the network",
     )
     counts: Counts = Field(
-        (), description="Traffic counts. By default, random trips are drawn between the network's fringe edges"
+        (),
+        description="Traffic counts: rows, or the name of a CSV table with the columns from_edge and to_edge, or edge,"
+        " and count. By default, random trips are drawn between the network's fringe edges",
     )
     observed: str | None = Field(
         None,
