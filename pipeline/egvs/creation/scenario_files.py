@@ -234,7 +234,7 @@ def counts_csv(flows: Sequence[CountConfig], names: MovementNames) -> str:
         movement = names.movement(flow.edge or flow.from_edge or "", flow.to_edge)
         approach = approach_name(arrival_side(movement.heading), movement.street)
         ids = (flow.edge or "", flow.from_edge or "", flow.to_edge or "")
-        rows.append((approach, movement.turn, *ids, f"{flow.per_hour:.12g}"))
+        rows.append((approach, movement.turn, movement.way_out, *ids, f"{flow.per_hour:.12g}"))
     return _csv((*COUNT_NAMES, *COUNT_IDS, "count"), rows)
 
 

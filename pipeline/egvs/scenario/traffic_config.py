@@ -45,7 +45,7 @@ class VehicleKind(StrictModel):
         return attributes
 
 
-COUNT_IDS, COUNT_NAMES = ("edge", "from_edge", "to_edge"), ("approach", "turn")
+COUNT_IDS, COUNT_NAMES = ("edge", "from_edge", "to_edge"), ("approach", "turn", "to")
 """Columns of a table of counts: ids of edges, and names that are only for people."""
 
 MAX_PER_HOUR = 1e5

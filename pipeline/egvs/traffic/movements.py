@@ -52,6 +52,8 @@ class Movement(NamedTuple):
         A value of :data:`~egvs.traffic.directions.TURNS`; empty for all vehicles of an approach.
     aliases
         Other streets that lead to the approach.
+    way_out
+        Name of the street on which it leaves the junction; may be empty.
     """
 
     approach: tuple[Edge, ...]
@@ -59,6 +61,7 @@ class Movement(NamedTuple):
     heading: Floats
     turn: str
     aliases: tuple[str, ...] = ()
+    way_out: str = ""
 
 
 class MovementNames:
@@ -130,16 +133,17 @@ class MovementNames:
 
     def movement(self, from_edge: str, to_edge: str | None) -> Movement:
         """Return approach and turn of a movement; parameters as of :meth:`describe`."""
-        edges, turn = self._edges_to_junction(from_edge), ""
+        edges, turn, way_out = self._edges_to_junction(from_edge), "", ""
         if to_edge is not None:
             passage = self._passage(from_edge, to_edge)
             edges, turn = tuple(self._nearest.get(from_edge, passage).to_junction), self._turn(passage)
+            way_out = self._approaches.street(passage.from_junction[0].id)
         last = edges[-1].id
         ways = self._ways.get(from_edge, edges)
         aliases = [self._approaches.street(edge.id) for edge in ways] + [*self._approaches.aliases(last)]
         street = self._approaches.street(last)
         others = tuple(dict.fromkeys(name for name in aliases if name not in ("", street)))
-        return Movement(edges, street, self._approaches.heading(last), turn, others)
+        return Movement(edges, street, self._approaches.heading(last), turn, others, way_out)
 
     def _edges_to_junction(self, from_edge: str) -> tuple[Edge, ...]:
         if from_edge in self._nearest:
