@@ -28,11 +28,17 @@ def test_first_screen_says_what_for_whom_how_good_and_how_to_start(path: Path) -
         "City planners",
         "LiDAR engineers",
         "Researchers",
-        "pip install egvs egvs demo",
+        "pip install . egvs demo",
         "How good",
         "images/view",
     ):
         assert part in first_screen, part
+
+
+@pytest.mark.parametrize("path", [*ROOT.glob("*.md"), *DOCS.glob("*.md")], ids=lambda path: path.name)
+def test_no_command_needs_a_release(path: Path) -> None:
+    text = words(path).replace("rom the first release on, `pip install egvs` replaces `pip install .`", "")
+    assert re.search(r"pip install egvs\b(?!\[)", text) is None
 
 
 @pytest.mark.parametrize("path", FIRST_PAGES, ids=lambda path: path.name)
