@@ -232,7 +232,7 @@ def _levels(arguments: argparse.Namespace) -> int:
     data, out, corrections = arguments.data, arguments.out, CORRECTIONS_FILE
     if arguments.frames is not None or arguments.candidates is not None:
         protocol = streets.shortened(protocol, arguments.frames)
-        out = data = data / "trial"
+        out = data = data / f"trial_{arguments.frames or 'all'}_frames_{arguments.candidates or 'all'}_candidates"
         corrections = data / CORRECTIONS_FILE.name
     start_s = time.monotonic()
     rows = {}

@@ -22,7 +22,7 @@ FINEST_M = 0.15  # triangles are subdivided to this size, so that sorting by dis
 GAP_M, ROW_M, LABEL_M = 0.8, 7.0, 4.3
 
 
-def draw(path: Path) -> None:
+def draw(_: Path, images: Path) -> None:
     """Draw all bodies."""
     import matplotlib
 
@@ -53,7 +53,7 @@ def draw(path: Path) -> None:
     axes.margins(0.02)
     axes.set_ylim(-ROW_M * (len(ROWS) - 1) - 5.0, 2.8)
     axes.axis("off")
-    figure.savefig(path, metadata={"Software": None}, bbox_inches="tight")
+    figure.savefig(images / "bodies.png", metadata={"Software": None}, bbox_inches="tight")
     plt.close(figure)
 
 
