@@ -32,8 +32,9 @@ def shared(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Another machine: a folder to work in, with nothing of a store in it."""
+    """Another machine: a folder to work in, and a cache with nothing in it."""
     folder.mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
     monkeypatch.chdir(folder)
     return folder
 
@@ -48,7 +49,7 @@ def test_machine_fetches_entry_of_another_machine(
     assert set(states(scenario, other / "out").values()) == {"fetched"}
     assert digests(other / "out") == digests(one / "out")
     names = {path.rpartition("/")[2] for path in shared.ls("/shared/store", detail=False)}
-    assert names == {entry.folder.name for entry in Store(Path("runs/.store")).entries()}
+    assert names == {entry.folder.name for entry in Store(other / "cache" / "egvs" / "store").entries()}
     assert set(states(scenario, other / "again").values()) == {"fetched"}  # from this machine's folder
 
 
@@ -109,7 +110,7 @@ def test_rejects_unknown_url_scheme() -> None:
 
 def test_environment_variables_select_store(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_STORE", "s3://bucket/store")
-    assert store.read_store_settings()[0] == store.DEFAULT_FOLDER
+    assert store.read_store_settings()[0] == store.default_folder()
     assert store.remote_url() == "s3://bucket/store"
     with store.use_store("/a/folder", 5.0):
         assert store.read_store_settings() == (Path("/a/folder"), 5.0)

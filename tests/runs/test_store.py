@@ -388,11 +388,17 @@ def test_an_empty_name_is_no_store(
     assert run_egvs("store")[1].strip() == "EGVS_STORE is empty: results are not cached"
 
 
-def test_the_default_store_is_next_to_the_runs(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_store_is_the_users_and_serves_all_working_folders(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("EGVS_STORE")
-    monkeypatch.chdir(tmp_path)
-    egvs.run(egvs.load(mini))
-    assert len(assert_whole(tmp_path / "runs" / ".store")) == len(STAGE_NAMES)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for folder, state in (("one", "done"), ("other", "fetched")):
+        (tmp_path / folder).mkdir()
+        monkeypatch.chdir(tmp_path / folder)
+        assert set(states(egvs.load(mini), Path("runs/mini")).values()) == {state}
+        assert [path.name for path in Path("runs").iterdir()] == ["mini"]
+    assert len(assert_whole(tmp_path / "cache" / "egvs" / "store")) == len(STAGE_NAMES)
 
 
 def test_the_command_line_lists_prunes_and_clears(done: tuple[egvs.Scenario, Path], store: Path, run_egvs) -> None:
@@ -433,18 +439,18 @@ def test_foreign_files_in_the_store_are_not_touched(
     assert {name: (store / name).read_text() for name in others} == dict.fromkeys(others, "of somebody else")
 
 
-@pytest.mark.parametrize("name", [".store", ".store/mine", "elsewhere/../.store", "link", "link/mine"])
+@pytest.mark.parametrize("name", ["store", "store/mine", "elsewhere/../store", "link", "link/mine"])
 @pytest.mark.parametrize("verb", ["run", "statics", "accuracy"])
 def test_a_run_does_not_go_into_the_store(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs, verb: str, name: str
 ) -> None:
-    """It would wait for ever on its own lock; the store by default, which a run's folder lies beside, is no other."""
+    """It would wait for ever on its own lock."""
     monkeypatch.delenv("EGVS_STORE")
-    monkeypatch.chdir(tmp_path)
-    (store := tmp_path / "runs" / ".store").mkdir(parents=True)
-    (tmp_path / "runs" / "link").symlink_to(store)
-    code, _, said = run_egvs(verb, mini, "--out", f"runs/{name}")
-    assert (code, said.count("the store (runs/.store) or inside it")) == (2, 1), said
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (store := tmp_path / "egvs" / "store").mkdir(parents=True)
+    (tmp_path / "egvs" / "link").symlink_to(store)
+    code, _, said = run_egvs(verb, mini, "--out", tmp_path / "egvs" / name)
+    assert (code, said.count(f"the store ({store}) or inside it")) == (2, 1), said
     assert not list(store.iterdir())
 
 

@@ -6,6 +6,7 @@ Entries here are single files of known size, and their times are set.
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from pathlib import Path
@@ -118,21 +119,34 @@ def test_full_store_is_reduced_once(tmp_path: Path, store: Path, lists: list[int
     assert len(lists) == n_lists
 
 
-def _put_many(store: Path, out: Path, numbers: range) -> None:
+def _put_many(store: Path, bound_bytes: float, out: Path, numbers: range) -> None:
     for number in numbers:
-        put(Store(store), number, out)
+        bounded = Store(store, bound_bytes)
+        key = put(bounded, number, out)
+        bounded.take("part", key, out)  # another process may have removed it
+        if bound_bytes < math.inf:
+            bounded.prune(bound_bytes / 2)
 
 
 @pytest.mark.slow
-def test_several_processes_count_every_entry(tmp_path: Path, store: Path) -> None:
+@pytest.mark.parametrize("most_entries", [math.inf, 20])
+def test_several_processes_add_and_remove_entries(
+    tmp_path: Path, store: Path, most_entries: float, capfd: pytest.CaptureFixture[str]
+) -> None:
     ranges = [range(start, start + 40) for start in range(0, 160, 40)]
-    running = [CONTEXT.Process(target=_put_many, args=(store, tmp_path / str(r.start), r)) for r in ranges]
+    bound_bytes = most_entries * SIZE
+    running = [CONTEXT.Process(target=_put_many, args=(store, bound_bytes, tmp_path / str(r.start), r)) for r in ranges]
     for process in running:
         process.start()
     for process in running:
         process.join()
         assert process.exitcode == 0
-    assert recorded_bytes(store) == 160 * SIZE == sum(entry.bytes for entry in Store(store).entries())
+    assert capfd.readouterr().err == ""  # no entry was damaged, and the store could be written
+    entries = Store(store).entries()
+    assert recorded_bytes(store) == len(entries) * SIZE
+    assert len(entries) == 160 if most_entries == math.inf else 1 <= len(entries) <= most_entries
+    assert len([path for path in store.iterdir() if path.is_dir()]) == len(entries) + len({".work", ".locks"})
+    assert not list((store / ".work").iterdir())
 
 
 def test_entries_in_use_stay(tmp_path: Path, store: Path, lists: list[int]) -> None:

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import platformdirs
+
 MAX_OLD_CACHES = 2
 """Number of caches of other sources that stay, the most recently used ones: a running program may need one."""
 
@@ -63,9 +65,14 @@ def _candidate_folders(package: Path, chosen: str | None) -> Iterator[Path]:
         yield from _user_folders()
 
 
+def user_cache_path() -> Path:
+    """Return the folder ``egvs`` in the user's cache, which may not exist."""
+    return platformdirs.user_cache_path("egvs", appauthor=False)
+
+
 def _user_folders() -> Iterator[Path]:
-    with suppress(RuntimeError):  # a user without a home
-        yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "egvs"
+    if user_cache_path().is_absolute():  # not so for a user without a home
+        yield user_cache_path()
     yield from _temporary_folders()
 
 

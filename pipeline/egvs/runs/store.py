@@ -1,6 +1,6 @@
 """The store: results of stages cached by a hash of their inputs (:mod:`egvs.runs.stage_keys`).
 
-The cache is a folder on this machine, and optionally a store shared by machines::
+The cache is a folder on this machine, by default in the user's cache, and optionally a store shared by machines::
 
     <store>/<stage>-<key>/          artefacts, companions, and entry.json: hashes (also its own), summary, cost
     <store>/.locks/<stage>-<key>    held by the process that makes this entry; others wait for it, then use the entry
@@ -44,6 +44,7 @@ from typing import Any
 
 from egvs.artefacts.run_folder import STAGE_NAMES
 from egvs.core import files, plugins
+from egvs.core.cache_folder import user_cache_folder, user_cache_path
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.reading import translate_errors
@@ -165,7 +166,6 @@ STORE_VARIABLE, MAX_GB_VARIABLE = "EGVS_STORE", "EGVS_STORE_MAX_GB"
 """Environment variables: location of the store (a folder, or a URL that machines share; empty for no store), and the
 largest size of its folder."""
 
-DEFAULT_FOLDER = Path("runs", ".store")
 DEFAULT_MAX_GB = 10.0
 
 _PRUNED_SHARE = 0.9
@@ -231,10 +231,15 @@ def _store_location() -> str | None:
 
 
 def _local_folder(location: str | None) -> Path | None:
-    """The folder on this machine: :data:`DEFAULT_FOLDER` where the location is a URL or not set."""
+    """The folder on this machine: :func:`default_folder` where the location is a URL or not set."""
     if location is None or _is_url(location):
-        return DEFAULT_FOLDER
+        return default_folder()
     return Path(location) if location else None
+
+
+def default_folder() -> Path:
+    """Return the folder of the store in the user's cache, which all runs of a user share."""
+    return (user_cache_folder() or user_cache_path()) / "store"
 
 
 def _is_url(location: str) -> bool:
@@ -440,7 +445,7 @@ class Store:
 
     @classmethod
     def default(cls) -> Store:
-        """Return the store that ``EGVS_STORE`` names, by default :data:`DEFAULT_FOLDER`."""
+        """Return the store that ``EGVS_STORE`` names, by default :func:`default_folder`."""
         url = remote_url()
         return cls(*read_store_settings(), remote=None if url is None else RemoteStore(url))
 

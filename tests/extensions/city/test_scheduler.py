@@ -171,10 +171,10 @@ def test_needs_store(monkeypatch: pytest.MonkeyPatch) -> None:
         scheduler.make_run_settings()
 
 
-def test_default_store_is_absolute_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_store_is_absolute_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("EGVS_STORE")
-    assert scheduler.make_run_settings().store == str(tmp_path / "runs" / ".store")
+    monkeypatch.setenv("EGVS_STORE", "results/store")
+    assert scheduler.make_run_settings().store == str(tmp_path / "results" / "store")
 
 
 def test_jobs_and_settings_are_small(jobs: list[Job]) -> None:

@@ -326,7 +326,7 @@ def checked_workers(
     """
     settings = make_run_settings(n_junctions)
     url = store.remote_url()
-    store_folder = store.DEFAULT_FOLDER if url is not None else Path(settings.store)
+    store_folder = store.default_folder() if url is not None else Path(settings.store)
     for message in expected_size_messages(store_folder, settings.store_bytes, n_junctions):
         on_message(message)
     shared_folders = writable_folders([*folders, store_folder] if url is None else folders)
