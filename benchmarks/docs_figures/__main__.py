@@ -93,7 +93,7 @@ def main() -> int:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    names = [each.name for each in (*SESSIONS, *GROUPS)]
+    names = [session.name for session in SESSIONS] + [group.name for group in GROUPS]
     parser.add_argument("--only", nargs="+", choices=names, default=names, metavar="NAME", help=", ".join(names))
     parser.add_argument(
         "--work", type=Path, default=ROOT / "build" / "docs-figures", metavar="DIR", help="for the runs"

@@ -22,8 +22,8 @@ FINEST_M = 0.15  # triangles are subdivided to this size, so that sorting by dis
 GAP_M, ROW_M, LABEL_M = 0.8, 7.0, 4.3
 
 
-def draw(_: Path, images: Path) -> None:
-    """Draw all bodies."""
+def draw(folder: Path, images: Path) -> None:
+    """Draw all bodies; nothing is run in the folder."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -32,7 +32,8 @@ STORY_FILES = (*STORY_FIGURES, "acceptance.svg", "story-sheet.png")
 def page_figure(page: Path, label: str) -> str:
     """Return the figure of a page whose accessible label begins with ``label``."""
     text = page.read_text(encoding="utf-8")
-    return next(svg for svg in re.findall(r"<svg.*?</svg>", text, re.DOTALL) if f'aria-label="{label}' in svg)
+    figures = (match[0] for match in re.finditer(r"<svg.*?</svg>", text, re.DOTALL))
+    return next(figure for figure in figures if f'aria-label="{label}' in figure)
 
 
 def draw_map(folder: Path, images: Path) -> None:

@@ -6,7 +6,9 @@ a comment before a block of code or a paragraph:
 
     <!-- printed: demo -->
 
-Of a block of code, each part between ``[...]`` must stand in the file; of a paragraph, each number. Tests compare the
+Of a block of code, each part between empty lines and ``[...]`` must stand in the file, or each of its lines; of a
+paragraph, each number, and each *sentence*
+with a number that is set in italics. Tests compare the
 pages with the files, and the files with a new run.
 """
 
@@ -39,7 +41,8 @@ _SIZE = re.compile(r"^(report +)[\d,]+ [kM]B", re.MULTILINE)
 _MARK = re.compile(r"^(?: *)<!-- printed: ([\w, ]+) -->\n+", re.MULTILINE)
 _FENCE = re.compile(r" *(```+)[^\n]*\n(.*?)\n *\1", re.DOTALL)
 _INDENTED = re.compile(r"(?: {4}[^\n]*\n|\n(?= {4}))+")
-_LEFT_OUT = re.compile(r"^\s*(?:\[?\.\.\.\]?|…)\s*$|\[\.\.\.\]|\.\.\.$", re.MULTILINE)
+_LEFT_OUT = re.compile(r"\n\s*\n|^\s*(?:\[?\.\.\.\]?|…)\s*$|\[\.\.\.\]|\.\.\.$", re.MULTILINE)
+_SPOKEN = re.compile(r"(?<!\*)\*([^*]*\d[^*]*)\*(?!\*)")
 _NUMBER = re.compile(r"(?<![\w.,#/])[+-]?\d[\d,]*(?:\.\d+)?(?: ± \d[\d,]*(?:\.\d+)?)?(?: %)?(?![\w]|\.\d)")
 
 
@@ -149,10 +152,13 @@ class Quote:
         """Return the parts of the text that are not in what the sessions print."""
         if self.is_code:
             whole = one_line(printed)
-            parts = [one_line(part) for part in _LEFT_OUT.split(without_times(self.text))]
-            return [part for part in parts if part not in whole]
-        known = set(numbers_of(printed))
-        return [number for number in numbers_of(self.text) if number not in known]
+            parts = [part for part in _LEFT_OUT.split(without_times(self.text)) if one_line(part) not in whole]
+            return [line for part in parts for line in map(one_line, part.splitlines()) if line not in whole]
+        whole, known = one_line(printed), set(numbers_of(printed))
+        spoken = [one_line(part) for part in _SPOKEN.findall(self.text)]
+        return [part for part in spoken if part not in whole] + [
+            number for number in numbers_of(self.text) if number not in known
+        ]
 
 
 def one_line(text: str) -> str:

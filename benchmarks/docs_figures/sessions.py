@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -11,10 +13,13 @@ import numpy as np
 from tests.creation.overpass_server import overpass_server, recorded_answer, send
 from tests.extensions.hardware.installation.simulated_scan import box, simulate_scan
 
-from benchmarks.docs_figures.printed import REAL, Session, run_command
+from benchmarks.docs_figures.printed import DOCS, REAL, Session, run_command
 from egvs.artefacts.traffic_frames import read_frames
 from egvs.extensions.hardware.installation.planned_sites import PlannedSites
 from egvs.formats import point_clouds
+
+POLES = (("text", "site,longitude"), ("toml", r"\[sites\]\nfile = .poles"))
+"""Language and first line of the blocks of the tutorial that are files."""
 
 TILT_ERROR_DEG = 1.5
 POLE_M = 0.6
@@ -65,6 +70,25 @@ def write_scans(folder: Path, name: str) -> None:
         point_clouds.write_points(folder / f"{file}.pcd", points)
 
 
+def run_tutorial(session: Session, folder: Path) -> list[str]:
+    """Run the commands of docs/tutorial.md; its poles replace those of the new scenario after the first run."""
+    shutil.copy(REAL / "bad_hersfeld.osm", folder / "extract.osm")
+    first, later = session.commands[:2], session.commands[2:]
+    outputs = [run_command(command, folder) for command in first]
+    page = (DOCS / "tutorial.md").read_text(encoding="utf-8")
+    poles, sites = (re.search(rf"```{kind}\n({start}.*?)```", page, re.DOTALL) for kind, start in POLES)
+    assert poles is not None and sites is not None
+    (folder / "hersfeld" / "poles.csv").write_text(poles[1], encoding="utf-8")
+    scenario = folder / "hersfeld" / "scenario.toml"
+    text = scenario.read_text(encoding="utf-8")
+    replaced, count = re.subn(
+        r"^\[sites\]\n.*?(?=^\[|\Z)", lambda _: sites[1] + "\n", text, flags=re.DOTALL | re.MULTILINE
+    )
+    assert count == 1
+    scenario.write_text(replaced, encoding="utf-8")
+    return outputs + [run_command(command, folder) for command in later]
+
+
 SESSIONS: tuple[Session, ...] = (
     Session("demo", ("egvs demo", "egvs place scenarios/demo --count 4"), results="egvs-demo/results", is_quick=True),
     Session(
@@ -90,7 +114,15 @@ SESSIONS: tuple[Session, ...] = (
     ),
     Session(
         "tutorial",
-        ("egvs new hersfeld --from extract.osm --at 50.8704,9.7080", "egvs run hersfeld"),
+        (
+            "egvs new hersfeld --from extract.osm --at 50.8704,9.7080",
+            "egvs run hersfeld",
+            "egvs run hersfeld --all",
+            "egvs run hersfeld --set effects.rain.rate_mm_h=30",
+            "egvs compare hersfeld --sensors VLP-32C,VLP-16,OS1-128 --set "
+            """'costs.sensor={"VLP-16"=4000, "VLP-32C"=8000, "OS1-128"=18000}'""",
+        ),
+        run_tutorial,
         results="runs/hersfeld",
         needs=REAL / "bad_hersfeld.osm",
     ),

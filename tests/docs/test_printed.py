@@ -78,7 +78,8 @@ PRINTED = (
 @pytest.mark.parametrize(
     ("text", "stale"),
     [
-        ("It finds *74 ± 6 %* of\n1,040 vehicles.", []),
+        ("**It** *finds 74 ± 6 % of\n1,040 vehicles*.", []),
+        ("*It finds 74 ± 6 % of 1,040 cars.*", ["It finds 74 ± 6 % of 1,040 cars."]),
         ("It finds 75 ± 6 % of 1,040 vehicles.", ["75 ± 6 %"]),
         ("It finds 74 ± 6 % of 104 vehicles.", ["104"]),
         ("```text\nkerb_NW is the best: [...]\n1  kerb_NW 3  73.8 %\n```", []),
