@@ -1,5 +1,5 @@
-"""Add to the documentation site what comes from the program: the diagram of the packages, tables of public names
-and of study results, a reference page for each package, the notebooks, and formulas as MathML."""
+"""Add to the documentation site what comes from the program: the diagram of the packages, tables of public names,
+a reference page for each package, the notebooks, and formulas as MathML."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _VIEW = ROOT / "build" / "view.html"
 """The 3D view of a run, which `make docs` writes. Without it, the first page links to docs/explore.md."""
 _LINK_WITHOUT_VIEW = "](explore.md#one-file-to-share)"
 _ELSEWHERE = "https://unpkg.com/iframe-worker/shim"
-_INSERT = re.compile(r"<!-- (names of|picture of|study conditions|study table) ([\w-]+) -->")
+_INSERT = re.compile(r"<!-- (names of|picture of) ([\w-]+) -->")
 
 
 def on_config(config: MkDocsConfig) -> None:
@@ -66,10 +66,6 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         if _LINK_WITHOUT_VIEW not in markdown:
             raise ValueError(f"docs/index.md has no picture with the link {_LINK_WITHOUT_VIEW}")
         markdown = markdown.replace(_LINK_WITHOUT_VIEW, f"]({_VIEW.name})")
-    if page.file.src_uri == "validity-tables.md":
-        shown = {name for what, name in _INSERT.findall(markdown) if what == "study table"}
-        if missing := tables.study_files() - shown:
-            raise ValueError(f"docs/validity-tables.md does not show {', '.join(sorted(missing))}")
     markdown = _PICTURE.sub("<!-- picture of packages -->", markdown)
     if page.file.src_uri == "notebooks/index.md":
         markdown = notebooks.gallery(markdown)
@@ -105,6 +101,4 @@ def _first_line(path: Path) -> str:
 _MAKE = {
     "names of": tables.names,
     "picture of": lambda _: package_diagram.picture(),
-    "study conditions": tables.study_conditions,
-    "study table": tables.study_tables,
 }
