@@ -63,7 +63,7 @@ def _draw_straight_road(_: Path, images: Path) -> None:
 
 GROUPS = (
     Group("bodies", ("bodies.png",), bodies.draw),
-    Group("map", ("nishishinjuku.svg",), junctions.draw_map, "nishishinjuku"),
+    Group("plan", junctions.PLAN_FILES, junctions.draw_plan, "nishishinjuku"),
     Group("junction", junctions.STORY_FILES, junctions.draw_story, "story"),
     Group("explorer", explorer.FILES, _draw_explorer, "nishishinjuku"),
     Group("seeds", ("seeds.png",), junctions.draw_seeds),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import egvs
-from benchmarks.docs_figures.printed import ROOT
+from benchmarks.docs_figures.printed import ROOT, run_command
 from egvs.artefacts.readers import read_scores
 from egvs.drawing.svg_figures import standalone_svg
 from egvs.extensions.hardware import write_sheets
@@ -36,10 +36,42 @@ def page_figure(page: Path, label: str) -> str:
     return next(figure for figure in figures if f'aria-label="{label}' in figure)
 
 
-def draw_map(folder: Path, images: Path) -> None:
-    """Draw the map of candidate sites in the report of nishishinjuku."""
-    drawn = standalone_svg(page_figure(folder / "runs" / "nishishinjuku" / "report.html", "Map of"))
-    (images / "nishishinjuku.svg").write_text(drawn, encoding="utf-8")
+PLAN_FILES = ("nishishinjuku.svg", "points-overlap.svg", "export-dxf.png")
+
+SITE_PLAN_M = (165.0, 245.0), (222.0, 275.0)
+"""Part of the site plan that is drawn: from and to x and y."""
+
+
+def draw_plan(folder: Path, images: Path) -> None:
+    """Draw the map of sites, the overlap of points for people in the report of nishishinjuku, and its site plan."""
+    run = folder / "runs" / "nishishinjuku"
+    for name, label in (
+        ("nishishinjuku.svg", "Map of 13"),
+        ("points-overlap.svg", "From above: number of sensors of the plan that see a pedestrian"),
+    ):
+        drawn = standalone_svg(page_figure(run / "report.html", label))
+        (images / name).write_text(drawn, encoding="utf-8")
+    run_command("egvs export runs/nishishinjuku --to dxf", folder)
+    _draw_site_plan(run / "export" / "nishishinjuku.dxf", images / "export-dxf.png")
+
+
+def _draw_site_plan(drawing: Path, path: Path) -> None:
+    from ezdxf.addons.drawing.config import BackgroundPolicy, Configuration
+    from ezdxf.addons.drawing.frontend import Frontend
+    from ezdxf.addons.drawing.matplotlib import MatplotlibBackend
+    from ezdxf.addons.drawing.properties import RenderContext
+    from ezdxf.filemanagement import readfile
+    from matplotlib.figure import Figure
+
+    document = readfile(drawing)
+    figure = Figure(dpi=110)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    config = Configuration(background_policy=BackgroundPolicy.WHITE)
+    Frontend(RenderContext(document), MatplotlibBackend(axes), config=config).draw_layout(document.modelspace())
+    axes.set_aspect("equal", adjustable="box")
+    axes.set(xlim=SITE_PLAN_M[0], ylim=SITE_PLAN_M[1])
+    figure.set_size_inches(9.0, 9.0 * np.ptp(SITE_PLAN_M[1]) / np.ptp(SITE_PLAN_M[0]))
+    figure.savefig(path, metadata={"Software": None})
 
 
 def draw_story(folder: Path, images: Path) -> None:
