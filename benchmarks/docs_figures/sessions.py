@@ -35,13 +35,14 @@ PLAN = """phase,approach,movement,green_s
 
 def run_story(session: Session, folder: Path) -> list[str]:
     """Run the commands of docs/story.md: a local server answers as recorded, and scans are simulated."""
-    (folder / "plan.csv").write_text(PLAN, encoding="utf-8")
     with overpass_server(send(recorded_answer())) as server:
         environment = {"EGVS_OVERPASS_URL": server.url, "XDG_CACHE_HOME": str(folder / "cache")}
         environment |= {name: "" for name in os.environ if name.lower() in ("http_proxy", "all_proxy")}
         outputs = []
         for command in session.commands:
             words = command.split(" ")
+            if "plan.csv" in command:
+                (folder / "crossing" / "plan.csv").write_text(PLAN, encoding="utf-8")
             if words[1] == "accept" and not (folder / "measured.pcd").exists():
                 write_scans(folder, words[words.index("--site") + 1])
             is_refused = words[1] == "accept" and words[-1] != "corrected.pcd"

@@ -1,5 +1,5 @@
-"""Add to the documentation site what comes from the program: the diagram of the packages, tables of public names,
-a reference page for each package, the notebooks, and formulas as MathML."""
+"""Add to the documentation site what comes from the program: the diagram of the packages, tables of public names
+and of data, a reference page for each package, the notebooks, and formulas as MathML."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _VIEW = ROOT / "build" / "view.html"
 """The 3D view of a run, which `make docs` writes. Without it, the first page links to docs/explore.md."""
 _LINK_WITHOUT_VIEW = "](explore.md#one-file-to-share)"
 _ELSEWHERE = "https://unpkg.com/iframe-worker/shim"
-_INSERT = re.compile(r"<!-- (names of|picture of) ([\w-]+) -->")
+_INSERT = re.compile(r"<!-- (names of|picture of|data table) ([\w-]+) -->")
 
 
 def on_config(config: MkDocsConfig) -> None:
@@ -101,4 +101,5 @@ def _first_line(path: Path) -> str:
 _MAKE = {
     "names of": tables.names,
     "picture of": lambda _: package_diagram.picture(),
+    "data table": tables.data_table,
 }

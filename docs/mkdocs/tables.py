@@ -1,8 +1,9 @@
-"""Markdown tables for the site: the public names of a package."""
+"""Markdown tables for the site: the public names of a package, and files of data."""
 
 from __future__ import annotations
 
 import ast
+import csv
 import re
 from pathlib import Path
 
@@ -31,3 +32,10 @@ def _name(full: str, path: Path) -> str:
 def _as_code(text: str) -> str:
     """Text for a table cell; reStructuredText roles and literals become code."""
     return re.sub(r"(?::\w+:)?(`+)~?([^`]+)\1", r"`\2`", text).replace("|", "\\|").replace("\n", " ")
+
+
+def data_table(stem: str) -> str:
+    """All rows of ``docs/data/<stem>.csv``."""
+    with (ROOT / "docs" / "data" / f"{stem}.csv").open(encoding="utf-8", newline="") as file:
+        head, *rows = csv.reader(file)
+    return "\n".join("| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows])
