@@ -20,6 +20,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +42,7 @@ _SIZE = re.compile(r"^(report +)[\d,]+ [kM]B", re.MULTILINE)
 _MARK = re.compile(r"^(?: *)<!-- printed: ([\w, ]+) -->\n+", re.MULTILINE)
 _FENCE = re.compile(r" *(```+)[^\n]*\n(.*?)\n *\1", re.DOTALL)
 _INDENTED = re.compile(r"(?: {4}[^\n]*\n|\n(?= {4}))+")
+CODE_BLOCK = re.compile(r"^( *)```[^\n]*\n(.*?)\n\1```|((?:^ {4,}\S[^\n]*\n|\n(?= {4}\S))+)", re.MULTILINE | re.DOTALL)
 _LEFT_OUT = re.compile(r"\n\s*\n|^\s*(?:\[?\.\.\.\]?|…)\s*$|\[\.\.\.\]|\.\.\.$", re.MULTILINE)
 _SPOKEN = re.compile(r"(?<!\*)\*([^*]*\d[^*]*)\*(?!\*)")
 _NUMBER = re.compile(r"(?<![\w.,#/])[+-]?\d[\d,]*(?:\.\d+)?(?: ± \d[\d,]*(?:\.\d+)?)?(?: %)?(?![\w]|\.\d)")
@@ -94,6 +96,8 @@ class Session:
 
     def scores(self, folder: Path) -> dict[str, float]:
         """Return the share of vehicles found from each site in the run folder, in per cent with one decimal."""
+        if not self.results:
+            return {}
         rows = read_scores(folder / self.results / "scores.parquet").to_pylist()
         return {row["site"]: round(100.0 * row["expected_detections"], 1) for row in rows}
 
@@ -198,6 +202,22 @@ def quotes_of(page: Path) -> Iterator[Quote]:
             yield Quote(page, line, names, paragraph, is_code=False)
         else:
             raise InputError(f"{page}: line {line}", "expected a block or a paragraph after the comment", "Move it.")
+
+
+def block_of(page: Path, start: str) -> str:
+    """Return the block of code of a page that begins with a text, without its indentation.
+
+    Raises
+    ------
+    InputError
+        Unless there is one.
+    """
+    text = page.read_text(encoding="utf-8")
+    for match in CODE_BLOCK.finditer(text):
+        block = textwrap.dedent(match[2] or match[3])
+        if block.startswith(start):
+            return block.strip("\n") + "\n"
+    raise InputError(page, f"expected a block of code that begins with {start!r}", "Change benchmarks.docs_figures.")
 
 
 def pages() -> list[Path]:

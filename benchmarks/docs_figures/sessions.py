@@ -13,13 +13,10 @@ import numpy as np
 from tests.creation.overpass_server import overpass_server, recorded_answer, send
 from tests.extensions.hardware.installation.simulated_scan import box, simulate_scan
 
-from benchmarks.docs_figures.printed import DOCS, REAL, Session, run_command
+from benchmarks.docs_figures.printed import DOCS, REAL, Session, block_of, run_command, run_commands
 from egvs.artefacts.traffic_frames import read_frames
 from egvs.extensions.hardware.installation.planned_sites import PlannedSites
 from egvs.formats import point_clouds
-
-POLES = (("text", "site,longitude"), ("toml", r"\[sites\]\nfile = .poles"))
-"""Language and first line of the blocks of the tutorial that are files."""
 
 TILT_ERROR_DEG = 1.5
 POLE_M = 0.6
@@ -71,19 +68,28 @@ def write_scans(folder: Path, name: str) -> None:
         point_clouds.write_points(folder / f"{file}.pcd", points)
 
 
+def run_what_if(session: Session, folder: Path) -> list[str]:
+    """Run what-if with the tables of docs/certainty.md at nishishinjuku."""
+    page, junction = DOCS / "certainty.md", folder / "junction"
+    junction.mkdir()
+    text = 'extends = "../scenarios/nishishinjuku"\n\n' + block_of(page, "[what_if.")
+    (junction / "scenario.toml").write_text(text, encoding="utf-8")
+    (junction / "deliveries.csv").write_text(block_of(page, "x_m,y_m,yaw_deg,type"), encoding="utf-8")
+    return run_commands(session, folder)
+
+
 def run_tutorial(session: Session, folder: Path) -> list[str]:
     """Run the commands of docs/tutorial.md; its poles replace those of the new scenario after the first run."""
     shutil.copy(REAL / "bad_hersfeld.osm", folder / "extract.osm")
     first, later = session.commands[:2], session.commands[2:]
     outputs = [run_command(command, folder) for command in first]
-    page = (DOCS / "tutorial.md").read_text(encoding="utf-8")
-    poles, sites = (re.search(rf"```{kind}\n({start}.*?)```", page, re.DOTALL) for kind, start in POLES)
-    assert poles is not None and sites is not None
-    (folder / "hersfeld" / "poles.csv").write_text(poles[1], encoding="utf-8")
+    page = DOCS / "tutorial.md"
+    (folder / "hersfeld" / "poles.csv").write_text(block_of(page, "site,longitude"), encoding="utf-8")
+    sites = block_of(page, '[sites]\nfile = "poles.csv"')
     scenario = folder / "hersfeld" / "scenario.toml"
     text = scenario.read_text(encoding="utf-8")
     replaced, count = re.subn(
-        r"^\[sites\]\n.*?(?=^\[|\Z)", lambda _: sites[1] + "\n", text, flags=re.DOTALL | re.MULTILINE
+        r"^\[sites\]\n.*?(?=^\[|\Z)", lambda _: sites + "\n", text, flags=re.DOTALL | re.MULTILINE
     )
     assert count == 1
     scenario.write_text(replaced, encoding="utf-8")
@@ -113,6 +119,15 @@ SESSIONS: tuple[Session, ...] = (
         ("egvs run scenarios/nishishinjuku", "egvs place scenarios/nishishinjuku --count 2"),
         results="runs/nishishinjuku",
     ),
+    Session("what-if", ("egvs what-if junction --set traffic.frames=300",), run_what_if),
+    Session(
+        "sensor-design",
+        (
+            "egvs sensor design scenarios/nishishinjuku --pole c05 --sensors VLP-16,VLP-32C,OS1-128 --heights 2,6 "
+            "--channels 32 --set traffic.frames=1200",
+        ),
+    ),
+    Session("validate", ("egvs validate scenarios/demo --frames 60",)),
     Session(
         "tutorial",
         (
