@@ -55,6 +55,9 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         files.append(File.generated(config, _VIEW.name, abs_src_path=str(_VIEW)))
 
 
+_EXAMPLE = re.compile(r"^\[`([^`]+)`\]\((examples/[^)]+)\)$", re.MULTILINE)
+"""A link to a file of an example, alone in its line: the site shows the file itself."""
+
 _PICTURE = re.compile(r"<!-- picture of packages -->.*?<!-- end of picture -->", re.DOTALL)
 """The picture as text, for readers of the file; the site has a drawing of the imports in its place."""
 
@@ -67,9 +70,17 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             raise ValueError(f"docs/index.md has no picture with the link {_LINK_WITHOUT_VIEW}")
         markdown = markdown.replace(_LINK_WITHOUT_VIEW, f"]({_VIEW.name})")
     markdown = _PICTURE.sub("<!-- picture of packages -->", markdown)
+    markdown = _EXAMPLE.sub(_show_file, markdown)
     if page.file.src_uri == "notebooks/index.md":
         markdown = notebooks.gallery(markdown)
     return notebooks.link_pages(_INSERT.sub(lambda m: _MAKE[m[1]](m[2]), markdown))
+
+
+def _show_file(link: re.Match[str]) -> str:
+    """Return a block of code with the content of a linked file."""
+    name, path = link.groups()
+    language = {"py": "python", "j2": "html"}.get(name.rpartition(".")[2], "toml")
+    return f'```{language} title="{name}"\n{(ROOT / "docs" / path).read_text(encoding="utf-8")}```'
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
