@@ -75,7 +75,6 @@ STORED = {
     "accuracy.png": "egvs accuracy scenarios/nishishinjuku",
     "scaling.png": "make scaling",
     "detectability.png": "python -m benchmarks.across_junctions fit --write FILE --figure FILE",
-    "measured-detection.png": "python -m benchmarks.measured_detection",
     "sensor-fit-angles.png": "egvs sensor fit",
     "sensor-fit-ground.png": "egvs sensor fit",
     "sensor-fit-empty-scan.png": "egvs sensor fit",

@@ -35,7 +35,6 @@ MOVED: dict[str, Any] = {"from": "c03", "pose": Pose(196.6, 251.7, 2.0, 0.0, 1.0
 
 PICTURES: dict[str, tuple[Camera, dict[str, Any]]] = {
     "explore": (ABOVE, {"layer": "missed", **MOVED}),
-    "explore-dark": (ABOVE, {"layer": "missed", **MOVED, "is_dark": True}),
     "explore-1-opened": (ABOVE, {"layer": "traffic"}),
     "explore-2-moved": (ABOVE, {"layer": "seen", **MOVED}),
     "explore-3-lanes": (ABOVE, {"layer": "blindspots", **MOVED}),

@@ -22,11 +22,11 @@ TILT_ERROR_DEG = 1.5
 POLE_M = 0.6
 """Distance of the pole that stands before the sensor in ``blocked.pcd``."""
 
-PLAN = """phase,approach,movement,green_s
-1,north,all,60
-1,south,all,60
-2,east,all,12
-2,west,all,12
+PLAN = """phase,approach,movement,green_s,yellow_s,all_red_s
+1,north,all,60,3,2
+1,south,all,60,3,2
+2,east,all,12,3,2
+2,west,all,12,3,2
 """
 
 
@@ -81,7 +81,7 @@ def run_what_if(session: Session, folder: Path) -> list[str]:
 def run_tutorial(session: Session, folder: Path) -> list[str]:
     """Run the commands of docs/tutorial.md; its poles replace those of the new scenario after the first run."""
     shutil.copy(REAL / "bad_hersfeld.osm", folder / "extract.osm")
-    first, later = session.commands[:2], session.commands[2:]
+    first, later = session.commands[:3], session.commands[3:]
     outputs = [run_command(command, folder) for command in first]
     page = DOCS / "tutorial.md"
     (folder / "hersfeld" / "poles.csv").write_text(block_of(page, "site,longitude"), encoding="utf-8")
@@ -133,6 +133,7 @@ SESSIONS: tuple[Session, ...] = (
         (
             "egvs new hersfeld --from extract.osm --at 50.8704,9.7080",
             "egvs run hersfeld",
+            "egvs run hersfeld --set score.sampled_frames=1000",
             "egvs run hersfeld --all",
             "egvs run hersfeld --set effects.rain.rate_mm_h=30",
             "egvs compare hersfeld --sensors VLP-32C,VLP-16,OS1-128 --set "
