@@ -26,6 +26,14 @@ STORY_FIGURES = {
 }
 """File -> page, and how the label of the figure begins."""
 
+ACCEPTANCE = (
+    ("Expected", "Expected"),
+    ("Measured", "Measured"),
+    ("", "Colour scale"),
+    ("Difference: a pole stops the beams in red; returns in yellow are nearer than expected", "Differences"),
+)
+"""Title and beginning of the label of each figure of the range images."""
+
 STORY_FILES = (*STORY_FIGURES, "acceptance.svg", "story-sheet.png")
 
 
@@ -81,7 +89,7 @@ def draw_story(folder: Path, images: Path) -> None:
     for name, (page, label) in STORY_FIGURES.items():
         (images / name).write_text(standalone_svg(page_figure(folder / page, label)), encoding="utf-8")
     (accepted,) = (folder / "run" / "acceptance").glob("*.html")
-    parts = [page_figure(accepted, label) for label in ("Expected", "Measured", "Colour scale", "Differences")]
+    parts = [(title, page_figure(accepted, label)) for title, label in ACCEPTANCE]
     (images / "acceptance.svg").write_text(standalone_svg(_stacked(parts)), encoding="utf-8")
     ((_, sheet),) = write_sheets(folder / "run", kind="svg", out=folder / "sheet")
     cairosvg.svg2png(
@@ -89,17 +97,18 @@ def draw_story(folder: Path, images: Path) -> None:
     )
 
 
-def _stacked(figures: list[str]) -> str:
-    """Return figures of a page in one, below one another."""
-    sizes = [re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', figure) for figure in figures]
-    widths, heights = (np.array([float(size[i]) for size in sizes if size]) for i in (1, 2))
-    tops = np.concatenate([[0.0], np.cumsum(heights)])
-    placed = [
-        figure.replace("<svg", f'<svg y="{top:g}" width="{width:g}" height="{height:g}"', 1)
-        for figure, top, width, height in zip(figures, tops[:-1], widths, heights, strict=True)
-    ]
-    head = f'<svg class="plan" viewBox="0 0 {widths.max():g} {tops[-1]:g}" role="img">'
-    return head + "".join(placed) + "</svg>"
+def _stacked(figures: list[tuple[str, str]]) -> str:
+    """Return titles and figures of a page as one figure, below one another."""
+    parts, width, top = [], 0.0, 0.0
+    for title, figure in figures:
+        size = re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', figure)
+        assert size is not None
+        if title:
+            parts.append(f'<text x="8" y="{top + 16:g}" font-size="14">{title}</text>')
+            top += 24.0
+        parts.append(figure.replace("<svg", f'<svg y="{top:g}" width="{size[1]}" height="{size[2]}"', 1))
+        width, top = max(width, float(size[1])), top + float(size[2])
+    return f'<svg class="plan" viewBox="0 0 {width:g} {top:g}" role="img">{"".join(parts)}</svg>'
 
 
 def draw_seeds(folder: Path, images: Path) -> None:

@@ -214,9 +214,9 @@ def block_of(page: Path, start: str) -> str:
     """
     text = page.read_text(encoding="utf-8")
     for match in CODE_BLOCK.finditer(text):
-        block = textwrap.dedent(match[2] or match[3])
+        block = textwrap.dedent(match[2] or match[3]).strip("\n")
         if block.startswith(start):
-            return block.strip("\n") + "\n"
+            return f"{block}\n"
     raise InputError(page, f"expected a block of code that begins with {start!r}", "Change benchmarks.docs_figures.")
 
 
