@@ -155,7 +155,7 @@ def stale_quotes() -> list[str]:
         f"{quote.page.relative_to(ROOT)}:{quote.line}: not printed: {part}"
         for page in pages()
         for quote in quotes_of(page)
-        for part in quote.stale_parts("\n".join(session_of(name).file.read_text() for name in quote.sessions))
+        for part in quote.stale_parts("\n".join(session_of(name).stored for name in quote.sessions))
     ]
 
 

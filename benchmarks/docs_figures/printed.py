@@ -81,6 +81,11 @@ class Session:
         return PRINTED / f"{self.name}.txt"
 
     @property
+    def stored(self) -> str:
+        """The stored output; empty if there is none."""
+        return self.file.read_text(encoding="utf-8") if self.file.exists() else ""
+
+    @property
     def is_possible(self) -> bool:
         """Whether its input is there."""
         return self.needs is None or self.needs.exists()

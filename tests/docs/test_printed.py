@@ -28,7 +28,7 @@ def all_quotes() -> list[Quote]:
 
 @pytest.mark.parametrize("quote", all_quotes(), ids=lambda quote: f"{quote.page.name}:{quote.line}")
 def test_pages_quote_what_is_printed(quote: Quote) -> None:
-    printed = "\n".join(session_of(name).file.read_text(encoding="utf-8") for name in quote.sessions)
+    printed = "\n".join(session_of(name).stored for name in quote.sessions)
     assert not quote.stale_parts(printed), HINT
 
 
@@ -44,7 +44,7 @@ def test_program_prints_what_is_stored(session: Session, tmp_path: Path, monkeyp
         pytest.skip(f"{session.needs} is not beside the checkout")
     monkeypatch.setenv("EGVS_STORE", str(tmp_path / "store"))
     folder = tmp_path / session.name
-    assert session.printed(folder) == session.file.read_text(encoding="utf-8"), HINT
+    assert session.printed(folder) == session.stored, HINT
     assert session.scores(folder) == json.loads(SCORES.read_text(encoding="utf-8"))["sessions"][session.name], HINT
 
 
