@@ -89,7 +89,7 @@ def run_tutorial(session: Session, folder: Path) -> list[str]:
     scenario = folder / "hersfeld" / "scenario.toml"
     text = scenario.read_text(encoding="utf-8")
     replaced, count = re.subn(
-        r"^\[sites\]\n.*?(?=^\[|\Z)", lambda _: sites + "\n", text, flags=re.DOTALL | re.MULTILINE
+        r"^\[sites\].*?(?=^\[|\Z)", lambda _: sites + "\n", text, flags=re.DOTALL | re.MULTILINE
     )
     assert count == 1
     scenario.write_text(replaced, encoding="utf-8")
