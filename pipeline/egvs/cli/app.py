@@ -552,22 +552,28 @@ def sensors(
             " read.",
         ),
     ] = None,
+    scenario: Annotated[
+        Path | None, typer.Option(metavar="SCENARIO", help="Know the sensors of this scenario, too.")
+    ] = None,
 ) -> None:
     """List the sensor catalogue; with names or files of beams, print the details of these sensors."""
     from egvs.cli import run_tables
+    from egvs.scenario.loading import load
     from egvs.sensors.beam_files import is_beam_file, read_beam_file
-    from egvs.sensors.sensor import CATALOGUE, check_sensor_names
+    from egvs.sensors.sensor import CATALOGUE, check_sensor_names, scenario_sensor
 
+    loaded = None if scenario is None else load(scenario)
+    custom = {} if loaded is None else {name: scenario_sensor(name, loaded, "NAME") for name in loaded.sensors}
     if not names:
-        run_tables.print_sensors(CATALOGUE.values())
+        run_tables.print_sensors([*custom.values(), *CATALOGUE.values()])
         return
     files = {name: read_beam_file(Path(name)) for name in names if is_beam_file(name)}
-    check_sensor_names((name for name in names if name not in files), (), "NAME")
+    check_sensor_names((name for name in names if name not in files), custom, "NAME")
     for name in names:
         if name in files:
             run_tables.print_beam_file(Path(name), files[name])
         else:
-            run_tables.print_sensor_details([CATALOGUE[name]])
+            run_tables.print_sensor_details([custom[name] if name in custom else CATALOGUE[name]])
 
 
 @app.command(cls=cli_options.NewCommand)
