@@ -39,7 +39,7 @@ REAL = ROOT.parent / "shared" / "real"
 
 _TIMES = re.compile(r"^(\w[\w ]*?) +(?:[\d.,]+ s|from store|unchanged) +", re.MULTILINE)
 _SIZE = re.compile(r"^(report +)[\d,]+ [kM]B", re.MULTILINE)
-_MARK = re.compile(r"^(?: *)<!-- printed: ([\w, ]+) -->\n+", re.MULTILINE)
+_MARK = re.compile(r"^(?: *)<!-- printed: ([\w, -]+) -->\n+", re.MULTILINE)
 _FENCE = re.compile(r" *(```+)[^\n]*\n(.*?)\n *\1", re.DOTALL)
 _INDENTED = re.compile(r"(?: {4}[^\n]*\n|\n(?= {4}))+")
 CODE_BLOCK = re.compile(r"^( *)```[^\n]*\n(.*?)\n\1```|((?:^ {4,}\S[^\n]*\n|\n(?= {4}\S))+)", re.MULTILINE | re.DOTALL)
