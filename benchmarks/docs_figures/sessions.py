@@ -127,7 +127,7 @@ SESSIONS: tuple[Session, ...] = (
             "--channels 32 --set traffic.frames=1200",
         ),
     ),
-    Session("validate", ("egvs validate scenarios/demo --frames 60",)),
+    Session("validate", ("egvs validate scenarios/demo --frames 60 --detector cluster",)),
     Session(
         "tutorial",
         (
