@@ -62,8 +62,8 @@ def describe_joint_score(by: ScoreLabel, sensors: int) -> str:
     if sensors < 2 or by.name not in _INDEPENDENT_SCORES:
         return ""
     return (
-        "Joint shares are for sensors that detect each by itself, and assume that they miss vehicles independently of "
-        "each other; near 100 % they are upper ends (docs/placement.md)."
+        "Joint shares assume that sensors miss vehicles independently; near 100 % they are upper ends "
+        "(docs/placement.md)."
     )
 
 
