@@ -7,7 +7,7 @@ a comment before a block of code or a paragraph:
     <!-- printed: demo -->
 
 Of a block of code, each part between empty lines and ``[...]`` must stand in the file, or each of its lines; of a
-paragraph, each number, and each *sentence*
+paragraph, each number (signs may be left out), and each *sentence*
 with a number that is set in italics. Tests compare the
 pages with the files, and the files with a new run.
 """
@@ -163,7 +163,8 @@ class Quote:
             whole = one_line(printed)
             parts = [part for part in _LEFT_OUT.split(without_times(self.text)) if one_line(part) not in whole]
             return [line for part in parts for line in map(one_line, part.splitlines()) if line not in whole]
-        whole, known = one_line(printed), set(numbers_of(printed))
+        whole = one_line(printed)
+        known = {sign for number in numbers_of(printed) for sign in (number, number.lstrip("+-"))}
         spoken = [one_line(part) for part in _SPOKEN.findall(self.text)]
         return [part for part in spoken if part not in whole] + [
             number for number in numbers_of(self.text) if number not in known

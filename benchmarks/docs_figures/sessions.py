@@ -88,9 +88,7 @@ def run_tutorial(session: Session, folder: Path) -> list[str]:
     sites = block_of(page, '[sites]\nfile = "poles.csv"')
     scenario = folder / "hersfeld" / "scenario.toml"
     text = scenario.read_text(encoding="utf-8")
-    replaced, count = re.subn(
-        r"^\[sites\].*?(?=^\[|\Z)", lambda _: sites + "\n", text, flags=re.DOTALL | re.MULTILINE
-    )
+    replaced, count = re.subn(r"^\[sites\].*?(?=^\[|\Z)", lambda _: sites + "\n", text, flags=re.DOTALL | re.MULTILINE)
     assert count == 1
     scenario.write_text(replaced, encoding="utf-8")
     return outputs + [run_command(command, folder) for command in later]
