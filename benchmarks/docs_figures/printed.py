@@ -7,9 +7,8 @@ a comment before a block of code or a paragraph:
     <!-- printed: demo -->
 
 Of a block of code, each part between empty lines and ``[...]`` must stand in the file, or each of its lines; of a
-paragraph, each number (signs may be left out), and each *sentence*
-with a number that is set in italics. Tests compare the
-pages with the files, and the files with a new run.
+paragraph, each number (signs may be left out), and each *sentence* with a number that is set in italics. Tests compare
+the pages with the files, and the files with a new run.
 """
 
 from __future__ import annotations
