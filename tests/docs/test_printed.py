@@ -35,10 +35,11 @@ def test_pages_quote_what_is_printed(quote: Quote) -> None:
 @pytest.mark.parametrize(
     "session",
     [
-        pytest.param(session, id=session.name, marks=[] if session.is_quick else [pytest.mark.slow, pytest.mark.system])
+        pytest.param(session, id=session.name, marks=[] if session.is_quick else [pytest.mark.slow])
         for session in SESSIONS
     ],
 )
+@pytest.mark.system
 def test_program_prints_what_is_stored(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if not session.is_possible:
         pytest.skip(f"{session.needs} is not beside the checkout")
