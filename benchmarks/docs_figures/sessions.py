@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -13,7 +11,7 @@ import numpy as np
 from tests.creation.overpass_server import overpass_server, recorded_answer, send
 from tests.extensions.hardware.installation.simulated_scan import box, simulate_scan
 
-from benchmarks.docs_figures.printed import DOCS, REAL, Session, block_of, run_command, run_commands
+from benchmarks.docs_figures.printed import DOCS, Session, block_of, run_command, run_commands
 from egvs.artefacts.traffic_frames import read_frames
 from egvs.extensions.hardware.installation.planned_sites import PlannedSites
 from egvs.formats import point_clouds
@@ -78,22 +76,6 @@ def run_what_if(session: Session, folder: Path) -> list[str]:
     return run_commands(session, folder)
 
 
-def run_tutorial(session: Session, folder: Path) -> list[str]:
-    """Run the commands of docs/tutorial.md; its poles replace those of the new scenario after the first run."""
-    shutil.copy(REAL / "bad_hersfeld.osm", folder / "extract.osm")
-    first, later = session.commands[:3], session.commands[3:]
-    outputs = [run_command(command, folder) for command in first]
-    page = DOCS / "tutorial.md"
-    (folder / "hersfeld" / "poles.csv").write_text(block_of(page, "site,longitude"), encoding="utf-8")
-    sites = block_of(page, '[sites]\nfile = "poles.csv"')
-    scenario = folder / "hersfeld" / "scenario.toml"
-    text = scenario.read_text(encoding="utf-8")
-    replaced, count = re.subn(r"^\[sites\].*?(?=^\[|\Z)", lambda _: sites + "\n", text, flags=re.DOTALL | re.MULTILINE)
-    assert count == 1
-    scenario.write_text(replaced, encoding="utf-8")
-    return outputs + [run_command(command, folder) for command in later]
-
-
 SESSIONS: tuple[Session, ...] = (
     Session("demo", ("egvs demo", "egvs place scenarios/demo --count 4"), results="egvs-demo/results", is_quick=True),
     Session(
@@ -126,21 +108,6 @@ SESSIONS: tuple[Session, ...] = (
         ),
     ),
     Session("validate", ("egvs validate scenarios/demo --frames 60 --detector cluster",)),
-    Session(
-        "tutorial",
-        (
-            "egvs new hersfeld --from extract.osm --at 50.8704,9.7080",
-            "egvs run hersfeld",
-            "egvs run hersfeld --set score.sampled_frames=1000",
-            "egvs run hersfeld --all",
-            "egvs run hersfeld --set effects.rain.rate_mm_h=30",
-            "egvs compare hersfeld --sensors VLP-32C,VLP-16,OS1-128 --set "
-            """'costs.sensor={"VLP-16"=4000, "VLP-32C"=8000, "OS1-128"=18000}'""",
-        ),
-        run_tutorial,
-        results="runs/hersfeld",
-        needs=REAL / "bad_hersfeld.osm",
-    ),
 )
 
 
