@@ -29,7 +29,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import Grid, Roi
 from egvs.core.sumo_home import sumo_home
 from egvs.scenario.effects_config import EffectsConfig
-from egvs.scenario.fields import Latitude, Longitude, Name, Point2, Point3, Positive, StrictModel
+from egvs.scenario.fields import Latitude, Longitude, Name, Point2, Point3, Positive, SensorMount, StrictModel
 from egvs.scenario.score_config import CostsConfig, PlacementConfig, ScoreConfig, default_gamma
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.scenario.traffic_config import TrafficConfig
@@ -253,12 +253,16 @@ class SitesConfig(StrictModel):
         description="Pitch, positive for nose up, or 'aim'; each value of a list is a candidate. By default 'aim' for "
         "sites that are aimed, else 0",
     )
-    roll_deg: float = Field(0.0, description="Roll about the sensor's x axis")
+    roll_deg: float = Field(0.0, description="Roll about the sensor's x axis; from upside down, if it is inverted")
+    mount: SensorMount | None = Field(
+        None, description="'inverted': upside down, with the front in the same direction. By default that of the sensor"
+    )
 
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out replace_sensor where it is not set, so that it does not change cache keys."""
-        return {name: value for name, value in serialize(self).items() if name != "replace_sensor" or value is not None}
+        """Leave out newer keys where they are not set, so that they do not change cache keys."""
+        newer = ("replace_sensor", "mount")
+        return {name: value for name, value in serialize(self).items() if name not in newer or value is not None}
 
     @model_validator(mode="after")
     def _check_source(self) -> SitesConfig:
