@@ -3,7 +3,7 @@
     python -m benchmarks.docs_figures [--only NAME ...] [--work DIR]
 
 Names are those of :data:`SESSIONS` (commands whose output pages quote) and :data:`GROUPS` (pictures). A picture of a
-session's run is drawn from that run. ``docs/data/printed/scores.json`` has the scores that it was drawn from; a test
+session's run is drawn from that run. ``docs/printed/scores.json`` has the scores that it was drawn from; a test
 fails when they are no longer those that the program computes. Pictures of long studies, and of recordings that are not
 shipped, are in :data:`STORED` with the command that draws them. At the end, parts of pages that are no longer printed
 are listed.

@@ -1,7 +1,7 @@
 """Commands whose output README and docs quote, and where pages quote it.
 
 ``make docs-figures`` runs the commands of each :class:`Session`, and writes what they print to
-``docs/data/printed/NAME.txt`` and the scores of their runs to ``scores.json`` beside it. A page marks what it quotes by
+``docs/printed/NAME.txt`` and the scores of their runs to ``scores.json`` beside it. A page marks what it quotes by
 a comment before a block of code or a paragraph:
 
     <!-- printed: demo -->
@@ -29,7 +29,7 @@ from egvs.core.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-PRINTED = DOCS / "data" / "printed"
+PRINTED = DOCS / "printed"
 SCORES = PRINTED / "scores.json"
 """Scores of sessions, and those that pictures were drawn from."""
 
