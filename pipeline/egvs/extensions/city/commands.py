@@ -402,7 +402,8 @@ def print_comparison(comparison: PlanComparison) -> None:
 
 app = typer.Typer(no_args_is_help=True, help="Run every junction of a city, on one machine or a cluster.")
 
-for verb in (new, traffic, run, place, compare):
+app.command(cls=options.PointCommand)(new)
+for verb in (traffic, run, place, compare):
     app.command()(verb)
 
 COMMANDS = (Command("city", "Decide", app),)
