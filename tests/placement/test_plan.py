@@ -535,3 +535,19 @@ def test_says_that_time_limit_was_reached(three_candidates: Path, tmp_path: Path
             "place", three_candidates, "--out", tmp_path / "out", "--count", 2, "--exact", "--time-limit", "9s"
         )
         assert ("--exact reached its --time-limit of 9s" in text) is has_note
+
+
+def test_rule_that_forbids_one_more_is_named(five_candidates: Path, out: Path, run_egvs) -> None:
+    """Three candidates at two poles, one sensor for each pole: the explorer recommends no third one either."""
+    rules = ("--set", "placement.most_per_pole=1", "--set", "placement.excluded=['c', 'd']")
+    code, text, error = run_egvs("place", five_candidates, "--out", out, "--count", 3, *rules)
+    assert code == 0, error
+    assert "most_per_pole = 1 forbids a third sensor beside them." in text and "adds nothing" not in text
+    assert "most_per_pole = 1 forbids a third sensor beside them." in (out / "report.html").read_text()
+    plan = egvs.open_session(out).plan
+    assert plan is not None and len(plan.sites) == 2
+    assert (plan.best_next, plan.forbids_more) == (None, "most_per_pole = 1")
+
+    apart = ("--set", "placement.least_distance_m=1000")
+    _, text, _ = run_egvs("place", five_candidates, "--out", out / "apart", "--count", 3, *apart)
+    assert "least_distance_m = 1000 forbids a second sensor beside it." in text

@@ -459,6 +459,7 @@ def _make_placement(
         zones=tuple(zones),
         is_best=solution.is_best,
         fewest_is_proved=solution.fewest_is_proved,
+        forbids_more=given.rules.what_forbids_more(solution.order),
     )
 
 

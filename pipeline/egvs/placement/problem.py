@@ -313,6 +313,22 @@ class PlanRules:
             allowed &= total_cost <= self.budget * (1.0 + _COST_TOLERANCE)
         return allowed
 
+    def what_forbids_more(self, plan: Sequence[int]) -> str:
+        """Return the rules that forbid every other candidate beside a plan, whatever the count and the budget are.
+
+        Empty if one may be added, or there is no other.
+        """
+        unlimited = replace(self, count=len(self.cost) + 1, budget=np.inf)
+        without_rules = replace(unlimited, most_per_pole=len(self.cost), least_distance_m=0.0)
+        if unlimited.allowed_additions(plan).any() or not without_rules.allowed_additions(plan).any():
+            return ""
+        rules = {
+            f"most_per_pole = {self.most_per_pole}": replace(without_rules, most_per_pole=self.most_per_pole),
+            f"least_distance_m = {self.least_distance_m:g}": replace(unlimited, most_per_pole=len(self.cost)),
+        }
+        free = without_rules.allowed_additions(plan)
+        return " and ".join(name for name, alone in rules.items() if (free & ~alone.allowed_additions(plan)).any())
+
     def allows(self, plan: Sequence[int]) -> bool:
         """Whether a plan, in any order, keeps the rules and contains the forced candidates."""
         if not set(self.forced) <= set(plan):

@@ -307,8 +307,8 @@ def describe_classes_by_size(sites: Sequence[SiteSummary]) -> str:
         return ""
     counts = ", ".join(f"{total[name]:,} {name}" for name in CLASSES if total[name])
     return (
-        f"Labelled by size: {counts}. Their vClass is that of cars, but they are longer than {MAX_CAR_LENGTH_M:g} m; set "
-        "vclass in traffic.kinds, or vClass in the vehicle types."
+        f"Labelled by size: {counts}. Their vClass is that of cars, but they are longer than {MAX_CAR_LENGTH_M:g} m; "
+        "set vclass in traffic.kinds, or vClass in the vehicle types."
     )
 
 

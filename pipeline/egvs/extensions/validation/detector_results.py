@@ -1,7 +1,8 @@
 """Classes of objects, and the files of what detectors found.
 
-The class of a box follows from its SUMO vClass. A box with the vClass of a car that is longer than any car has the class
-of its size: SUMO's default vClass is passenger, also for the types of buses and trucks that name none. Where KITTI has a name for the class, that name is used:
+The class of a box follows from its SUMO vClass. SUMO's default vClass is passenger, also for types of buses and trucks
+that name none; so a box with the vClass of a car that is too long for one has the class of its size. Where KITTI has a
+name for the class, that name is used:
 
 ======================================================================== ==============
 SUMO vClass                                                              class
