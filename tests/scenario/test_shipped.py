@@ -41,7 +41,7 @@ def test_load_finds_shipped_scenario_unless_a_folder_has_its_name(
             r"Give a folder with a scenario.toml, or the name of a shipped scenario: demo, hill, .*roundabout\.$",
         ),
         ("nishi-shinjuku", r"Did you mean nishishinjuku\?$"),
-        ("./roundabout", r"Did you mean roundabout\?$"),
+        ("elsewhere/roundabout", r"Did you mean roundabout\?$"),
     ],
 )
 def test_unknown_folder_lists_shipped_scenarios(

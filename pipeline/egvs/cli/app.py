@@ -150,17 +150,18 @@ def check(
     scenario: SettingsPath,
     set_: Set = None,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Also print what protects this machine from the scenario's files.")
+        bool,
+        typer.Option("--verbose", help="Print all poles, and what protects this machine from the scenario's files."),
     ] = False,
 ) -> None:
-    """Check a scenario before a run, and print all errors and warnings. No files are written."""
+    """Check a scenario before a run: print where the poles stand, all errors and warnings. No files are written."""
     from egvs.cli import run_tables
     from egvs.core import sandbox
     from egvs.runs.run_sources import SettingsSource
     from egvs.stages import check
 
     checked = check.check_scenario(SettingsSource.of(scenario, set_).load())
-    run_tables.print_check(checked)
+    run_tables.print_check(checked, with_details=verbose)
     if verbose:
         run_tables.print_protections(sandbox.missing_protections())
     if checked.errors:

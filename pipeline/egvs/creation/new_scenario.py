@@ -51,6 +51,7 @@ from egvs.creation.junctions import JunctionRegion, KerbsidePole, StreetJunction
 from egvs.creation.map_parts import (
     DECK_BASE_M,
     DEFAULT_BUILDING_M,
+    OBJECT_KIND,
     OUT_OF_RANGE,
     ImportCounts,
     MapContext,
@@ -79,7 +80,7 @@ from egvs.creation.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.creation.terrain.relief import Relief, ground_surface
 from egvs.formats.archives import unpack_archives
 from egvs.scenario.loading import load
-from egvs.scenario.model import SCENARIO_FILE
+from egvs.scenario.model import NO_SURROUNDINGS, POLE_POSITIONS, SCENARIO_FILE
 from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
 from egvs.sensors.sensor import CATALOGUE
@@ -938,7 +939,15 @@ def _assumptions(draft: _Draft) -> list[str]:
     assumed = list(draft.traffic.assumptions)
     if draft.junction.signalised and not draft.plan.is_finished and not draft.plan.signal_notes:
         assumed.append(ASSUMED_PLANS)
-    return [*assumed, *draft.plan.assumptions, *assumed_sizes(draft.objects.counts), "positions of the poles"]
+    assumed += [*draft.plan.assumptions, *assumed_sizes(draft.objects.counts)]
+    kinds = {solid.kind for solid in draft.objects.solids} | {mesh.kind for mesh in draft.objects.meshes}
+    if not any(kind.startswith(_SURROUNDINGS) for kind in kinds):
+        assumed.append(NO_SURROUNDINGS)
+    return [*assumed, POLE_POSITIONS]
+
+
+_SURROUNDINGS = ("building", "roof", "tree", "vegetation", "mesh", OBJECT_KIND)
+"""Kinds of solids, or their beginnings, that can hide vehicles; a map without any probably has roads only."""
 
 
 def assumed_sizes(counts: ImportCounts) -> list[str]:

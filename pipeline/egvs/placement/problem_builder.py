@@ -30,7 +30,7 @@ from egvs.scoring.targets import VisibleTargets
 from egvs.scoring.visibility import Beams, HitCounter
 from egvs.scoring.zones import placement_zones, region_bounds_m
 from egvs.sensors.sensor import check_sensor_names
-from egvs.sensors.sites import Site, candidate_sites
+from egvs.sensors.sites import Site, candidate_sites, pole_exists
 from egvs.stages.base import StageContext
 from egvs.stages.site_scans import SiteScan, empty_scans
 from egvs.stages.site_scoring import TargetScorer
@@ -574,8 +574,9 @@ def candidate_costs(scenario: Scenario, sites: Sequence[Site]) -> tuple[FloatArr
         if costs.sensor and site.sensor not in costs.sensor:
             problem_text = f"the cost of sensor {site.sensor} (site {site.name}) is unknown"
             raise InputError(f"{scenario.file}: costs.sensor", problem_text, f'Add "{site.sensor}" = COST.')
-        cost[i] = costs.of_mount(site.sensor, site.pose.z_m)
-        pole_cost[i] = costs.pole
+        exists = pole_exists(site.pole, scenario.sites.existing_poles)
+        cost[i] = costs.of_mount(site.sensor, site.pose.z_m, pole_exists=exists)
+        pole_cost[i] = 0.0 if exists else costs.pole
         _check_cost(f"{scenario.file}: costs ({site.name})", float(cost[i]))
     return cost, pole_cost
 

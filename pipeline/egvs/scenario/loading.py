@@ -298,7 +298,7 @@ def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
     return _merge(_drop_replaced_keys(base, values), values)
 
 
-_SITE_SOURCE_KEYS = ("points", "only_free", "heights_m")
+_SITE_SOURCE_KEYS = ("points", "only_free", "heights_m", "existing_poles")
 """Keys of ``[sites]`` that go with one source of sites; a new source does not take them over."""
 _POLYGON_KEYS = ("polygon_height_m", "polygon_types")
 """Keys of ``[statics]`` that go with ``polygons``."""

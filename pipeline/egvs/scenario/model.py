@@ -123,6 +123,12 @@ class MeshConfig(StrictModel):
         return None
 
 
+POLE_POSITIONS = "positions of the poles"
+"""Entry of the key ``assumed``: no candidate pole is known to exist."""
+
+NO_SURROUNDINGS = "surroundings (no building or tree is known)"
+"""Entry of the key ``assumed``: no map has anything that could hide vehicles."""
+
 TERRAIN_KEY = "statics.terrain"
 """The key of the file with the ground beyond the roads."""
 
@@ -254,11 +260,16 @@ class SitesConfig(StrictModel):
         "sites that are aimed, else 0",
     )
     roll_deg: float = Field(0.0, description="Roll about the sensor's x axis")
+    existing_poles: tuple[str, ...] | Literal["all"] = Field(
+        (), description="Names of poles that exist, or 'all': they cost nothing, and their positions are not assumed"
+    )
 
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out replace_sensor where it is not set, so that it does not change cache keys."""
-        return {name: value for name, value in serialize(self).items() if name != "replace_sensor" or value is not None}
+        """Leave out keys that are not set and were added later, so that they do not change cache keys."""
+        values = serialize(self)
+        added = {"replace_sensor": None, "existing_poles": []}
+        return {name: value for name, value in values.items() if name not in added or value not in (added[name], ())}
 
     @model_validator(mode="after")
     def _check_source(self) -> SitesConfig:

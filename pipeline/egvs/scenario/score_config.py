@@ -299,9 +299,10 @@ class CostsConfig(StrictModel):
         """Whether any cost is set."""
         return bool(self.sensor or self.pole or self.metre)
 
-    def of_mount(self, sensor: str, z_m: float) -> float:
+    def of_mount(self, sensor: str, z_m: float, *, pole_exists: bool) -> float:
         """Return the cost of a sensor at a height, with its pole; a sensor without a cost of its own counts 0."""
-        return self.sensor.get(sensor, 0.0) + self.pole + self.metre * z_m
+        pole = 0.0 if pole_exists else self.pole
+        return self.sensor.get(sensor, 0.0) + pole + self.metre * z_m
 
 
 class ZoneDemand(ZoneArea):

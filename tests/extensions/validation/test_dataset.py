@@ -291,4 +291,4 @@ def test_python_function_writes_the_files_of_the_command(four_sites, tmp_path, r
     for path in (tmp_path / "one").rglob("*.*"):
         assert (other / path.relative_to(tmp_path / "one")).read_bytes() == path.read_bytes()
     with pytest.raises(InputError, match="is not empty"):
-        write_clouds(load(four_sites), other)
+        write_clouds(load(four_sites), other, frames=2)
