@@ -32,6 +32,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import by_number, number_of
 from egvs.creation import (
     assumed_traffic,
@@ -437,6 +438,53 @@ def create_scenario(
         _plan_traffic(draft)
         draft.notes = [unpacked.user_text(note) for note in draft.notes]
         return _write_scenario(draft)
+
+
+@dataclass(frozen=True)
+class ListedJunction:
+    """A junction of a map: its description, arms and incoming lanes, signals, and the value of ``--at`` there."""
+
+    title: str
+    arms: int
+    lanes_in: int
+    signalised: bool
+    at: str
+
+
+def list_junctions(
+    maps: Sequence[str | Path], options: NewScenarioOptions | None = None, progress: ProgressCallback = no_progress
+) -> list[ListedJunction]:
+    """Return the junctions of a road map of which a scenario can be made, the largest first; nothing is written.
+
+    Parameters
+    ----------
+    maps
+        As for :func:`create_scenario`.
+    options
+        ``lefthand``, ``righthand`` and ``walk`` are used.
+    progress
+        Called at the beginning of each step.
+
+    Raises
+    ------
+    InputError
+        When a file is damaged or of an unknown format, or the road map has no drivable streets.
+    """
+    options = options or NewScenarioOptions()
+    with unpack_archives([Path(path) for path in maps]) as unpacked:
+        progress("opens the maps", 0, 0)
+        files = map_readers.open_maps(unpacked.paths)
+        progress("reads the roads", 0, 0)
+        road_options = RoadOptions(options.lefthand, options.walk, bool(files.terrain), None, options.righthand)
+        streets = _read_roads(files.roads, road_options).streets
+        progress("lists the junctions", 0, 0)
+        return [
+            ListedJunction(
+                junction.title, junction.arms, junction.lanes_in, junction.signalised,
+                _at_option(streets, junction.at_m),
+            )
+            for junction in junctions.distinct_crossings(streets)
+        ]  # fmt: skip
 
 
 def _open_files(

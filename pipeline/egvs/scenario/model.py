@@ -267,9 +267,11 @@ class SitesConfig(StrictModel):
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out keys that are not set and were added later, so that they do not change cache keys."""
-        values = serialize(self)
-        added = {"replace_sensor": None, "existing_poles": []}
-        return {name: value for name, value in values.items() if name not in added or value not in (added[name], ())}
+        values: dict[str, Any] = serialize(self)
+        for name in ("replace_sensor", "existing_poles"):
+            if not values[name]:
+                del values[name]
+        return values
 
     @model_validator(mode="after")
     def _check_source(self) -> SitesConfig:

@@ -96,7 +96,7 @@ def new(
         centre = options.latitude_and_longitude(around, "--around")
     if radius is not None:
         radius_m = options.length_m(radius, "--radius")
-    with ProgressDisplay("city") as screen:
+    with ProgressDisplay("city", prints_progress=True) as screen:
         from egvs.extensions.city import creation, new_summary
 
         new_options = creation.NewCityOptions(
