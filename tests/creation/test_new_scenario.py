@@ -429,5 +429,5 @@ def test_roads_without_buildings_and_trees_assume_open_surroundings(tmp_path: Pa
     (tmp_path / "roads.osm").write_text(roads)
     for name, is_assumed in ((SMALL, False), (tmp_path / "roads.osm", True)):
         create_scenario(tmp_path / f"out_{is_assumed}", name)
-        assumed = load(tmp_path / f"out_{is_assumed}").assumed
+        assumed = loading.load(tmp_path / f"out_{is_assumed}").assumed
         assert ("surroundings (no building or tree is known)" in assumed) is is_assumed
