@@ -18,10 +18,11 @@ expected_visibility    voxels with traffic    1 where a beam crosses            
 points_on_target       vehicle-frames         points                                      ln(1 + t)
 seen_well              vehicle-frames         points                                      1 - exp(-t / n0)
 expected_detections    vehicle-frames         -ln(1 - detection probability)              1 - exp(-t)
+those of plug-ins      vehicle-frames         -ln(1 - value)                              1 - exp(-t)
 =====================  =====================  ==========================================  ==================
 
-``expected_detections`` treats sensors as independent: a vehicle is missed when each sensor by itself misses it. It does
-not model detectors that work on merged point clouds.
+The last two treat sensors as independent: a vehicle is missed when each sensor by itself misses it. They do not model
+detectors that work on merged point clouds.
 
 Amounts and their totals are whole numbers, so the value of a plan depends neither on the order of its sensors nor on
 the number of threads. They are stored as sparse rows, in memory or, above :data:`MAX_BYTES_IN_MEMORY`, in a temporary

@@ -16,6 +16,7 @@ from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.wording import format_percent
 from egvs.results.labels import ScoreLabel, join_names
 from egvs.results.plans import PlannedSensor, PlanStep, SensorPlan
+from egvs.scenario.score_config import is_plugin_score
 
 MIN_USEFUL_SHARE = 0.01
 """A useful sensor adds at least 1 percentage point; to scores that are no shares, at least 1 % of the plan's score."""
@@ -60,7 +61,7 @@ def describe_joint_score(by: ScoreLabel, sensors: int) -> str:
     sensors
         Number of sensors of the plan.
     """
-    if sensors < 2 or by.name not in _INDEPENDENT_SCORES:
+    if sensors < 2 or not (by.name in _INDEPENDENT_SCORES or is_plugin_score(by.name)):
         return ""
     return (
         "Joint shares are for sensors that detect each by itself, and assume that they miss vehicles independently of "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
     AfterValidator,
@@ -14,6 +14,7 @@ from pydantic import (
     model_validator,
 )
 
+from egvs.core import plugins
 from egvs.scenario.fields import Name, NotNegative, Point2, Positive, StrictModel, find_duplicates
 
 VehicleClass = Literal[
@@ -34,6 +35,32 @@ OtherScore = Literal[
 ]  # fmt: skip
 """Scores besides the EGVS. ``noticed`` ranks no sites: it does not ask how well a box fits."""
 
+SCORES_GROUP = "egvs.scores"
+"""Entry points of scores; of those of other packages, a :class:`egvs.scoring.target_scores.VehicleScore` can rank."""
+
+_BUILTIN_SCORES = frozenset({*get_args(RankingScore), *get_args(OtherScore)})
+
+
+def is_plugin_score(name: str) -> bool:
+    """Return whether a score is not one of this program, so that an installed package has to provide it."""
+    return name not in _BUILTIN_SCORES
+
+
+def _check_plugin_score(name: str) -> str:
+    """Return the name of a score of another package; ValueError where none is installed."""
+    others = [other for other in plugins.plugin_names(SCORES_GROUP) if _is_of_another_package(other)]
+    if name in others:
+        return name
+    raise ValueError(f"expected one of {', '.join([*get_args(RankingScore), *others])}, got {name[:80]!r}")
+
+
+def _is_of_another_package(name: str) -> bool:
+    return plugins.plugin_package(SCORES_GROUP, name) != plugins.PACKAGE_NAME
+
+
+PluginScore = Annotated[str, AfterValidator(_check_plugin_score)]
+"""Name of a score that another package provides."""
+
 DEFAULT_SCORE: OtherScore = "expected_detections"
 """The score that the validation study recommends (docs/validity.md), and that new scenarios rank by."""
 
@@ -42,6 +69,12 @@ NOTICED: OtherScore = "noticed"
 
 VEHICLE_SCORES: tuple[OtherScore, ...] = ("expected_detections", "noticed", "seen_well", "points_on_target")
 """Scores that are means over the vehicles of recorded frames."""
+
+
+def is_vehicle_score(name: str) -> bool:
+    """Return whether a score is a mean over the vehicles of recorded frames, as all plug-in scores that rank are."""
+    return name in VEHICLE_SCORES or is_plugin_score(name)
+
 
 Detector = Literal[
     "cluster", "pointpillars", "pointpillars_sensor", "cluster_uncorrected", "pointpillars_uncorrected"
@@ -168,7 +201,9 @@ class ScoreConfig(StrictModel):
         description="Cap of the beams that count in one voxel: 0, at least 1e-9, or inf. 'auto' depends on the "
         "size of voxels: 10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), and half of that with moving_occlusion",
     )
-    rank_by: RankingScore = Field("egvs", description="Score that sites are ranked by")
+    rank_by: RankingScore | PluginScore = Field(
+        "egvs", description="Score that sites are ranked by; or one of an installed package (docs/extending.md)"
+    )
     others: tuple[OtherScore, ...] = Field(
         (DEFAULT_SCORE,), description="Further scores in scores.parquet, besides egvs and the score of rank_by"
     )
@@ -262,15 +297,15 @@ class ScoreConfig(StrictModel):
     @property
     def needs_vehicles(self) -> bool:
         """Whether a score, the blind spots or the zones need the vehicles of recorded frames."""
-        return self.blindspots or self.zones is not None or any(name in VEHICLE_SCORES for name in self.additional)
+        return self.blindspots or self.zones is not None or any(is_vehicle_score(name) for name in self.additional)
 
     @property
-    def additional(self) -> tuple[OtherScore, ...]:
+    def additional(self) -> tuple[str, ...]:
         """The scores to compute besides the EGVS, without duplicates; the one that sites are ranked by is the first.
 
         :data:`NOTICED` is computed whenever :data:`DEFAULT_SCORE` is.
         """
-        names = self.others
+        names: tuple[str, ...] = self.others
         if self.rank_by != "egvs":
             names = (self.rank_by, *(name for name in self.others if name != self.rank_by))
         if DEFAULT_SCORE in names and NOTICED not in names:
