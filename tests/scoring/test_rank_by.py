@@ -6,6 +6,8 @@ wrong use with its message."""
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
 
@@ -26,7 +28,7 @@ from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.stages import score
-from tests.core.test_plugins import install, site  # noqa: F401  the fixture
+from tests.core.test_plugins import clear_caches, install
 from tests.scoring import target_scenes as scenes
 from tests.stage_runner import inputs_of, run_stage
 
@@ -238,7 +240,7 @@ def test_additional_scores_are_unique() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("score.rank_by=detections", "score.rank_by: expected 'egvs'"),
+        ("score.rank_by=detections", "score.rank_by: expected one of egvs"),
         ('score.others=["egvs"]', "score.others.0: expected 'expected_detections'"),
         ('score.others=["seen_well","seen_well"]', "seen_well is listed twice"),
     ],
@@ -291,7 +293,7 @@ def test_the_expected_detections_are_those_of_the_calibration(mini: Path, tmp_pa
 VEHICLE_SCORE = """
 from egvs.scoring.target_scores import VehicleScore
 
-MY_SCORE = VehicleScore("my_score", "n / (n + 5) with n points", "an example", lambda seen: seen.points / (seen.points + 5.0))
+MY_SCORE = VehicleScore("my_score", "n / (n + 5)", "an example", lambda seen: seen.points / (seen.points + 5.0))
 WRONG = VehicleScore("wrong", "", "", lambda seen: seen.points + 2.0)
 OF_SITES = "a score of sites"
 """
@@ -299,10 +301,15 @@ PERIODS = 'traffic.periods=[{name="a", length_s=12}, {name="b", begin_s=12, leng
 
 
 @pytest.fixture
-def plugin(site: Path) -> None:  # noqa: F811
+def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A package of somebody else with scores."""
     entries = "my_score = plug_score:MY_SCORE\nwrong = plug_score:WRONG\nof_sites = plug_score:OF_SITES"
-    install(site, "somebody-elses", entries, {"plug_score": VEHICLE_SCORE}, SCORES_GROUP)
+    install(tmp_path / "site", "somebody-elses", entries, {"plug_score": VEHICLE_SCORE}, SCORES_GROUP)
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    clear_caches()
+    yield
+    clear_caches()
+    sys.modules.pop("plug_score", None)
 
 
 @pytest.mark.parametrize("periods", [(), (PERIODS,)], ids=["no periods", "periods"])

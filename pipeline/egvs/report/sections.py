@@ -56,8 +56,9 @@ def assumptions(scenario: Scenario, plans: Sequence[Mapping[str, Any]]) -> tuple
         assumed = tuple(chain.from_iterable(named if entry == ASSUMED_PLANS else (entry,) for entry in assumed))
     if scenario.sites.existing_poles == "all":
         assumed = tuple(entry for entry in assumed if entry != POLE_POSITIONS)
-    elif existing := join_names(scenario.sites.existing_poles):
-        assumed = tuple(entry.replace(POLE_POSITIONS, f"{POLE_POSITIONS} other than {existing}") for entry in assumed)
+    elif scenario.sites.existing_poles:
+        others = f"{POLE_POSITIONS} other than {join_names(scenario.sites.existing_poles)}"
+        assumed = tuple(others if entry == POLE_POSITIONS else entry for entry in assumed)
     statics = scenario.statics
     has_surroundings = statics.footprints or statics.polygons or statics.meshes or scenario.sites.points
     if not has_surroundings and NO_SURROUNDINGS not in assumed:

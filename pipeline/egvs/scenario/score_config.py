@@ -46,20 +46,17 @@ def is_plugin_score(name: str) -> bool:
     return name not in _BUILTIN_SCORES
 
 
-def _check_plugin_score(name: str) -> str:
-    """Return the name of a score of another package; ValueError where none is installed."""
+def _check_ranking_score(name: str) -> str:
+    """Return the name of a score that can rank sites; ValueError for any other, and for one that is not installed."""
     others = [other for other in plugins.plugin_names(SCORES_GROUP) if _is_of_another_package(other)]
-    if name in others:
-        return name
-    raise ValueError(f"expected one of {', '.join([*get_args(RankingScore), *others])}, got {name[:80]!r}")
+    if name not in (known := [*get_args(RankingScore), *others]):
+        raise ValueError(f"expected one of {', '.join(known)}, got {name[:80]!r}")
+    return name
 
 
 def _is_of_another_package(name: str) -> bool:
     return plugins.plugin_package(SCORES_GROUP, name) != plugins.PACKAGE_NAME
 
-
-PluginScore = Annotated[str, AfterValidator(_check_plugin_score)]
-"""Name of a score that another package provides."""
 
 DEFAULT_SCORE: OtherScore = "expected_detections"
 """The score that the validation study recommends (docs/validity.md), and that new scenarios rank by."""
@@ -201,8 +198,10 @@ class ScoreConfig(StrictModel):
         description="Cap of the beams that count in one voxel: 0, at least 1e-9, or inf. 'auto' depends on the "
         "size of voxels: 10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), and half of that with moving_occlusion",
     )
-    rank_by: RankingScore | PluginScore = Field(
-        "egvs", description="Score that sites are ranked by; or one of an installed package (docs/extending.md)"
+    rank_by: Annotated[str, AfterValidator(_check_ranking_score)] = Field(
+        "egvs",
+        description=f"Score that sites are ranked by: {', '.join(get_args(RankingScore))}, or a VehicleScore of an "
+        "installed package (docs/extending.md)",
     )
     others: tuple[OtherScore, ...] = Field(
         (DEFAULT_SCORE,), description="Further scores in scores.parquet, besides egvs and the score of rank_by"
