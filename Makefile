@@ -118,7 +118,7 @@ scaling: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.town_traffic
 
 numerics: $(VENV)/.installed-dev
-	$(BIN)/python -m benchmarks.numerics --markdown docs/numerics-table.md
+	$(BIN)/python -m benchmarks.numerics --csv docs/data/numerics.csv
 
 pictures: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.pictures

@@ -17,16 +17,16 @@ from tests import processes
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
 SMALL = Path(__file__).resolve().parents[1] / "creation" / "data" / "small.osm"
-_BLOCK = re.compile(r'^```\w+ title="([^"]+)"\n(.*?)^```$', re.DOTALL | re.MULTILINE)
+_FILE = re.compile(r"^\[`([^`]+)`\]\((examples/[^)]+)\)$", re.MULTILINE)
 _LINES = 35  # what a page of thirty lines may come to
 _CODE_LINES = 30
 
 
 def package(heading: str) -> dict[str, str]:
-    """The files that the page shows under one heading, by name."""
+    """The files of the example that the page shows under one heading, by name."""
     part = re.search(rf"^## {re.escape(heading)}\n(.*?)(?=^## |\Z)", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.M)
     assert part, f"{PAGE.name} has no heading {heading!r}"
-    return dict(_BLOCK.findall(part[1]))
+    return {name: (PAGE.parent / path).read_text(encoding="utf-8") for name, path in _FILE.findall(part[1])}
 
 
 def install(files: dict[str, str], folder: Path) -> Path:

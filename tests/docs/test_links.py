@@ -49,6 +49,15 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not problems
 
 
+@pytest.mark.parametrize("page", [page for page in PAGES if "<!-- data table" in page.read_text(encoding="utf-8")])
+def test_tables_of_data_have_a_file_and_a_link(page: Path) -> None:
+    """The site shows the table; readers of the file follow the link."""
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"<!-- data table (\S+) -->", text):
+        assert f"(data/{name}.csv)" in text
+        assert (page.parent / "data" / f"{name}.csv").is_file()
+
+
 def test_pages_have_links() -> None:
     count = sum(1 for page in PAGES for _ in links(page.read_text(encoding="utf-8")))
     assert len(PAGES) > 40

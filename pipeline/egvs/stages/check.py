@@ -33,7 +33,6 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     traffic_checks.check_period_weights,
     traffic_checks.check_demand,
     traffic_checks.check_internal_edges,
-    traffic_checks.warn_map_as_network,
     traffic_checks.check_signals,
     traffic_checks.warn_equal_demand,
     traffic_checks.check_recorded_positions,

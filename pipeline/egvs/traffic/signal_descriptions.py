@@ -39,7 +39,6 @@ def describe_simulated(scenario: Scenario, path: Path, roads: network.Network) -
         signal = find_signal(name, found, f"{scenario.file}: traffic.signals.{name}")
         planned[signal.id] = config.file or "from the scenario"
     is_assumed = any("signal" in entry for entry in scenario.assumed)
-    is_assumed |= scenario.traffic.network is not None and network.is_osm(Path(scenario.traffic.network))
     return describe_signals(found, scenario.roi.box, planned, ASSUMED_SOURCE if is_assumed else "from the network")
 
 
