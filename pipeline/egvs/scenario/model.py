@@ -269,8 +269,8 @@ class SitesConfig(StrictModel):
         """Leave out keys that are not set and were added later, so that they do not change cache keys."""
         values: dict[str, Any] = serialize(self)
         for name in ("replace_sensor", "existing_poles"):
-            if not values[name]:
-                del values[name]
+            if not values.get(name):
+                values.pop(name, None)
         return values
 
     @model_validator(mode="after")
