@@ -374,34 +374,35 @@ def pole_surroundings(inputs: CheckInputs) -> tuple[PoleSurroundings, ...]:
     if inputs.carriageway is not None and inputs.carriageway.lanes:
         kerb_m = inputs.carriageway.kerb_distance_m(at_m)
         on_road = {site.pole: place for site, place in _sites_on_road(sites, inputs.carriageway, inputs.network)}
+        beside: dict[int, str] = {}
         for number, site in enumerate(sites):
-            lane = inputs.carriageway.names[inputs.carriageway.nearest(at_m[number])]
-            beside = _describe_lane(lane, inputs.network).removeprefix("a lane of ")
-            where[number] = on_road.get(site.pole, f"beside {beside}")
-    walls_m = [math.nan] * len(sites) if inputs.world is None else _wall_distances_m(inputs.world, at_m)
-    rows = zip(sites, where, kerb_m.tolist(), walls_m, strict=True)
+            lane = inputs.carriageway.nearest(at_m[number])
+            if lane not in beside:
+                name = _describe_lane(inputs.carriageway.names[lane], inputs.network)
+                beside[lane] = f"beside {name.removeprefix('a lane of ')}"
+            where[number] = on_road.get(site.pole, beside[lane])
+    wall_m = np.full(len(sites), np.nan) if inputs.world is None else _wall_distances_m(inputs.world, at_m)
+    rows = zip(sites, where, kerb_m.tolist(), wall_m.tolist(), strict=True)
     return tuple(PoleSurroundings(site.pole, site.pose.x_m, site.pose.y_m, *rest) for site, *rest in rows)
 
 
-def _wall_distances_m(world: World, at_m: FloatArray) -> list[float]:
-    """Return the distance of each point (n, 2) to the nearest wall in plan; NaN for none."""
+def _wall_distances_m(world: World, at_m: FloatArray) -> FloatArray:
+    """Return the distance of each point (n, 2) to the nearest wall in plan, (n,); NaN for none."""
     import shapely
 
     no_wall = ("ground", "tree", "vegetation", *supports.KINDS)
     is_wall = np.array([not kind.lower().startswith(no_wall) for _, kind in world.solids], dtype=np.bool_)
     low_m, high_m = world.bounds_xy_m
-    distances = []
-    for point_m in at_m:
-        near = ((low_m <= point_m + MAX_WALL_M) & (high_m >= point_m - MAX_WALL_M)).all(axis=1)
-        faces = np.flatnonzero(near & is_wall[world.solid_of_face])
-        triangles = shapely.convex_hull(
-            shapely.multipoints(
-                world.triangles_m[faces][:, :, :2].reshape(-1, 2), indices=np.repeat(np.arange(len(faces)), 3)
-            )
-        )
-        nearest_m = shapely.distance(triangles, shapely.points(point_m)).min(initial=np.inf)
-        distances.append(float(nearest_m) if nearest_m <= MAX_WALL_M else math.nan)
-    return distances
+    is_near = ((low_m <= at_m.max(axis=0) + MAX_WALL_M) & (high_m >= at_m.min(axis=0) - MAX_WALL_M)).all(axis=1)
+    faces = np.flatnonzero(is_near & is_wall[world.solid_of_face])
+    corners_m = world.triangles_m[faces][:, :, :2].reshape(-1, 2)
+    areas = shapely.convex_hull(shapely.multipoints(corners_m, indices=np.repeat(np.arange(len(faces)), 3)))
+    (numbers, _), found_m = shapely.STRtree(areas).query_nearest(
+        shapely.points(at_m), max_distance=MAX_WALL_M, return_distance=True, all_matches=False
+    )
+    distances_m = np.full(len(at_m), np.nan)
+    distances_m[numbers] = found_m
+    return distances_m
 
 
 def warn_own_supports(inputs: CheckInputs) -> Iterator[Diagnostic]:

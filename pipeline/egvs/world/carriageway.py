@@ -121,9 +121,9 @@ class Carriageway:
         """Return the distance of each point (n, 2) to the edge of the carriageway, from outside or inside, (n,)."""
         import shapely
 
-        low_m, high_m = at_m.min(axis=0), at_m.max(axis=0)
-        margin_m = max(self.distance_m(point_m, point_m) for point_m in at_m) + 2.0 * LANE_WIDTH_M
-        lanes = self.within(low_m - margin_m, high_m + margin_m)
+        _, nearest_m = self._tree.query_nearest(shapely.points(at_m), return_distance=True, all_matches=False)
+        margin_m = nearest_m.max() + 2.0 * LANE_WIDTH_M
+        lanes = self.within(at_m.min(axis=0) - margin_m, at_m.max(axis=0) + margin_m)
         surface = shapely.union_all([shapely.buffer(lanes, clearances.LANE_INSET_M), self._junction_interiors])
         distance_m: FloatArray = shapely.distance(shapely.boundary(surface), shapely.points(at_m))
         return distance_m
