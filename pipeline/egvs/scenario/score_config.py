@@ -38,24 +38,23 @@ OtherScore = Literal[
 SCORES_GROUP = "egvs.scores"
 """Entry points of scores; of those of other packages, a :class:`egvs.scoring.target_scores.VehicleScore` can rank."""
 
-_BUILTIN_SCORES = frozenset({*get_args(RankingScore), *get_args(OtherScore)})
+
+def plugin_scores() -> list[str]:
+    """Return the names of the scores that other packages provide, sorted."""
+    names = plugins.plugin_names(SCORES_GROUP)
+    return [name for name in names if plugins.plugin_package(SCORES_GROUP, name) != plugins.PACKAGE_NAME]
 
 
 def is_plugin_score(name: str) -> bool:
-    """Return whether a score is not one of this program, so that an installed package has to provide it."""
-    return name not in _BUILTIN_SCORES
+    """Return whether a score is one that another package provides."""
+    return name not in get_args(OtherScore) and name in plugin_scores()
 
 
 def _check_ranking_score(name: str) -> str:
     """Return the name of a score that can rank sites; ValueError for any other, and for one that is not installed."""
-    others = [other for other in plugins.plugin_names(SCORES_GROUP) if _is_of_another_package(other)]
-    if name not in (known := [*get_args(RankingScore), *others]):
+    if name not in (known := [*get_args(RankingScore), *plugin_scores()]):
         raise ValueError(f"expected one of {', '.join(known)}, got {name[:80]!r}")
     return name
-
-
-def _is_of_another_package(name: str) -> bool:
-    return plugins.plugin_package(SCORES_GROUP, name) != plugins.PACKAGE_NAME
 
 
 DEFAULT_SCORE: OtherScore = "expected_detections"
