@@ -79,7 +79,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 def _show_file(link: re.Match[str]) -> str:
     """Return a block of code with the content of a linked file."""
     name, path = link.groups()
-    language = {"py": "python", "j2": "html"}.get(name.rpartition(".")[2], "toml")
+    language = {"py": "python", "j2": "html"}.get(suffix := name.rpartition(".")[2], suffix)
     return f'```{language} title="{name}"\n{(ROOT / "docs" / path).read_text(encoding="utf-8")}```'
 
 

@@ -55,7 +55,8 @@ def test_tables_of_data_have_a_file_and_a_link(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for name in re.findall(r"<!-- data table (\S+) -->", text):
         assert f"(data/{name}.csv)" in text
-        assert (page.parent / "data" / f"{name}.csv").is_file()
+        table = (page.parent / "data" / f"{name}.csv").read_text(encoding="utf-8")
+        assert not {target: reason for target in links(table) if (reason := problem(page, target))}
 
 
 def test_pages_have_links() -> None:

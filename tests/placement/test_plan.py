@@ -274,7 +274,10 @@ REJECTED = {
         ["--count", "1", "--reach", "0.01", "--set", ZONE % (0.5, 2)],
         "placement.zones: found no plan of 1 sensor that meets the requirements of all zones",
     ),
-    "no costs": (["--budget", "50"], "placement.budget: the cost of site a is unknown"),
+    "no costs": (
+        ["--budget", "50"],
+        'the cost of site a is unknown. Add a [costs] table, or a column "cost" to sites.csv.',
+    ),
     "a sensor without a price": (
         ["--budget", "50", "--set", "costs.sensor.VLP-16=1"],
         "costs.sensor: the cost of sensor small (site a) is unknown",

@@ -306,6 +306,11 @@ CSV = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\nb,east,a
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all,often"), "line 4: green_s: expected seconds, got 'often'"),
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all"), "line 4: expected 4 values, got 3"),
         ("p.csv", CSV.replace("green_s", "green_s,colour").replace("0\n", "0,red\n"), "unknown column 'colour'"),
+        *(
+            ("p.add.xml", f'<additional><tlLogic id="c"><phase duration="{text}" state="GG"/></tlLogic></additional>',
+             f"invalid <tlLogic> (ValueError(\"duration = '{text}': expected seconds, above 0\"))")
+            for text in ("nan", "-0", "-5", "9223372036854775807")
+        ),
         ("p.add.xml", "<additional/>", "no <tlLogic> with phases for the signal High Street / Mill Lane (c)"),
         ("p.add.xml", '<additional><tlLogic id="c"><phase duration="9" state="GG"/></tlLogic></additional>',
          "expected a state of 20 letters, got 2"),
@@ -405,3 +410,45 @@ def test_network_without_internal_links_is_rejected(crossing, tmp_path, signalis
 
     sumo.run_netconvert(["-s", "net.net.xml", "--no-internal-links", "false"], tmp_path, "new.net.xml")
     assert not network.read_net_xml(tmp_path / "new.net.xml").lacks_internal_edges
+
+
+PLANNED = """
+[roi]
+center_m = [0, 0, 2.5]
+size_m = [60, 60, 5]
+voxel_m = 1.0
+[traffic]
+network = "net.net.xml"
+vehicles = 6
+frames = 40
+warmup_s = 20.0
+{plan}
+[sites]
+file = "sites.csv"
+sensor = "VLP-16"
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plan", [
+    'signals.c.phases = [{ green = { north = ["all"], south = ["all"] }, green_s = 30 }, '
+    '{ green = { east = ["all"], west = ["all"] }, green_s = 20 }]',
+    'signals.c.file = "own.add.xml"',
+])  # fmt: skip
+def test_every_command_reads_a_run_with_plans(crossing, tmp_path, monkeypatch, run_egvs, plan):
+    """Its record has all defaults, e.g. of the limits of actuated phases."""
+    folder = shutil.copytree(crossing, tmp_path / "in")
+    (folder / "scenario.toml").write_text(PLANNED.format(plan=plan))
+    (folder / "sites.csv").write_text("site,x_m,y_m,z_m\na,12,12,5\nb,-12,-12,5\n")
+    net = (folder / "net.net.xml").read_text()
+    program = net[net.index("<tlLogic") : net.index("</tlLogic>") + len("</tlLogic>")]
+    (folder / "own.add.xml").write_text(f"<additional>{program}</additional>")
+    monkeypatch.chdir(tmp_path)
+    design = ("--pole", "a", "--sensors", "VLP-16", "--evaluations", "20", "--heights", "4,5")
+    for command in (
+        ("run", "in", "--out", "out"), ("place", "out", "--count", "2"), ("export", "out", "--to", "csv"),
+        ("figure", "out", "--what", "tpog", "--format", "svg"), ("sheets", "out", "--format", "svg"), ("report", "out"),
+        ("sensor", "design", "out", *design), ("verify", "out"),
+    ):  # fmt: skip
+        code, _, err = run_egvs(*command)
+        assert code == 0, (command, err)

@@ -19,7 +19,6 @@ from egvs.cli import environment, exit
 from egvs.cli import options as cli_options
 from egvs.cli.commands import ExtensibleGroup
 from egvs.cli.options import (
-    DEFAULT_POLES,
     Audit,
     Detector,
     Jobs,
@@ -93,8 +92,13 @@ def run(
     set_: Set = None,
     jobs: Jobs = None,
     audit: Audit = False,
-    top: Annotated[int, typer.Option("--top", metavar="N", min=1, help="Number of poles to print.")] = DEFAULT_POLES,
+    top: Annotated[
+        int | None, typer.Option("--top", metavar="N", min=1, help="Number of poles to print; by default 3 to 5.")
+    ] = None,
     all_: Annotated[bool, typer.Option("--all", help="Print the complete ranking of all sites and poles.")] = False,
+    count: Annotated[
+        int | None, typer.Option(metavar="K", min=1, help="Afterwards plan at most K sensors, as egvs place does.")
+    ] = None,
     verbose: Verbose = False,
     rehash: Rehash = False,
 ) -> None:
@@ -102,7 +106,7 @@ def run(
     from egvs.cli.console import ProgressDisplay
 
     stage_options = {"score": {"audit": True}} if audit else None
-    with ProgressDisplay("run", with_details=verbose) as screen:
+    with ProgressDisplay("run", with_details=verbose, is_run=True) as screen:
         from egvs.cli import answer, run_tables
         from egvs.runs.run import run, run_rehashed
 
@@ -119,7 +123,14 @@ def run(
     if verbose:
         run_tables.print_costs(folder, record)
     run_tables.print_audit(record)
-    answer.print_answer(folder, loaded, record, poles=None if all_ else top)
+    answer.print_answer(
+        folder, loaded, record, poles=top, with_details=verbose or all_, lines_before=screen.warning_lines
+    )
+    if count is not None:
+        from egvs.cli.place import place
+
+        print()
+        place(folder, count=count, jobs=jobs)
 
 
 @app.command()
@@ -132,7 +143,7 @@ def demo(
     """Try it: rank eight sites at a roundabout in about a minute, with traffic simulated in advance."""
     from egvs.cli.console import ProgressDisplay
 
-    with ProgressDisplay("demo") as screen:
+    with ProgressDisplay("demo", is_run=True) as screen:
         from egvs.cli import answer, run_tables
         from egvs.runs.run import run
         from egvs.scenario import shipped
@@ -142,7 +153,7 @@ def demo(
         results, loaded = folder / "results", load(folder)
         screen.flow_source = answer.flow_source(loaded)
         record = run(loaded, results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
-    answer.print_answer(results, loaded, record)
+    answer.print_answer(results, loaded, record, lines_before=screen.warning_lines)
     run_tables.print_demo_hints(results)
 
 
@@ -554,22 +565,28 @@ def sensors(
             " read.",
         ),
     ] = None,
+    scenario: Annotated[
+        Path | None, typer.Option(metavar="SCENARIO", help="Know the sensors of this scenario, too.")
+    ] = None,
 ) -> None:
     """List the sensor catalogue; with names or files of beams, print the details of these sensors."""
     from egvs.cli import run_tables
+    from egvs.scenario.loading import load
     from egvs.sensors.beam_files import is_beam_file, read_beam_file
-    from egvs.sensors.sensor import CATALOGUE, check_sensor_names
+    from egvs.sensors.sensor import CATALOGUE, check_sensor_names, scenario_sensor
 
+    loaded = None if scenario is None else load(scenario)
+    custom = {} if loaded is None else {name: scenario_sensor(name, loaded, "NAME") for name in loaded.sensors}
     if not names:
-        run_tables.print_sensors(CATALOGUE.values())
+        run_tables.print_sensors([*custom.values(), *CATALOGUE.values()])
         return
     files = {name: read_beam_file(Path(name)) for name in names if is_beam_file(name)}
-    check_sensor_names((name for name in names if name not in files), (), "NAME")
+    check_sensor_names((name for name in names if name not in files), custom, "NAME")
     for name in names:
         if name in files:
             run_tables.print_beam_file(Path(name), files[name])
         else:
-            run_tables.print_sensor_details([CATALOGUE[name]])
+            run_tables.print_sensor_details([custom[name] if name in custom else CATALOGUE[name]])
 
 
 @app.command(cls=cli_options.NewCommand)

@@ -70,9 +70,6 @@ Rehash = Annotated[
     bool,
     typer.Option("--rehash", help="Hash every file again, and make scans, TPOG and scores again to compare them."),
 ]
-DEFAULT_POLES = 5
-"""Poles that ``egvs run`` and ``egvs demo`` print unless options ask for others."""
-
 Audit = Annotated[
     bool, typer.Option("--audit", help="Check the voxel traversal of every beam, and print the worst deviation.")
 ]

@@ -34,6 +34,7 @@ from egvs.results.levels import GROUPS_NOTE, DetectionLevel, GroupLevel, read_le
 from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pole
 from egvs.scenario.score_config import ALL_DETECTORS, DEFAULT_SCORE, NOTICED
 from egvs.sensors.return_model import NEGLIGIBLE_LOSS, ReturnModel
+from egvs.sensors.sensor import FEW_BEAMS, FEW_BEAMS_HINT, describe_few_beams
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
@@ -425,13 +426,16 @@ def print_sensor_details(sensors: Iterable[Sensor]) -> None:
             )
         if sensor.assumed:
             lines.append(f"  assumed: {sensor.assumed}")
+        few = describe_few_beams(sensor)
+        if few is not None:
+            lines.append(f"  warning: {few}. {FEW_BEAMS_HINT}")
         print_sentences(lines)
 
 
 def print_beam_file(path: Path, file: BeamFile) -> None:
     """Print what was read of a file of beams, and how a scenario uses it."""
     from egvs.sensors.beam_files import BeamTable
-    from egvs.sensors.sensor import FEW_BEAMS, FEW_BEAMS_HINT, describe_odd_angles
+    from egvs.sensors.sensor import describe_odd_angles
 
     beams = file.beams
     if isinstance(beams, BeamTable):

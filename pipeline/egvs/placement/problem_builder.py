@@ -570,7 +570,8 @@ def candidate_costs(scenario: Scenario, sites: Sequence[Site]) -> tuple[FloatArr
             continue
 
         if has_budget and not costs.are_given:
-            hint = f'Add a [costs] table, or a "{COST_COLUMN}" column to the sites file.'
+            column = f', or a column "{COST_COLUMN}" to {scenario.sites.file}' if scenario.sites.file else ""
+            hint = f"Add a [costs] table{column}."
             raise InputError(f"{scenario.file}: placement.budget", f"the cost of site {site.name} is unknown", hint)
         if costs.sensor and site.sensor not in costs.sensor:
             problem_text = f"the cost of sensor {site.sensor} (site {site.name}) is unknown"

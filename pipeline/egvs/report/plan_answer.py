@@ -64,8 +64,8 @@ def describe_joint_score(by: ScoreLabel, sensors: int) -> str:
     if sensors < 2 or not (by.name in _INDEPENDENT_SCORES or is_plugin_score(by.name)):
         return ""
     return (
-        "Joint shares are for sensors that detect each by itself, and assume that they miss vehicles independently of "
-        "each other; near 100 % they are upper ends (docs/placement.md)."
+        "Joint shares assume that sensors miss vehicles independently; near 100 % they are upper ends "
+        "(docs/placement.md)."
     )
 
 

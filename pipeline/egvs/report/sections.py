@@ -13,6 +13,7 @@ from typing import Any
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import Diagnostic
+from egvs.core.wording import list_first
 from egvs.results.labels import join_names
 from egvs.results.ranking import Pole
 from egvs.scenario.model import NO_SURROUNDINGS, POLE_POSITIONS, Scenario
@@ -67,6 +68,31 @@ def assumptions(scenario: Scenario, plans: Sequence[Mapping[str, Any]]) -> tuple
     if has_demand or any(period.counts or period.routes for period in traffic.periods):
         return assumed
     return (*assumed, "traffic (random trips)")
+
+
+_BY_IMPORTANCE = ("traffic", "building is known", "surroundings", "positions", "signal", "heights of .*building")
+"""Beginnings of what scenarios assume, that which affects a ranking most first; all other entries follow."""
+
+
+_LONG = 75
+"""Longer lists of assumptions leave out what is in brackets."""
+
+
+def main_assumptions(assumed: Sequence[str], count: int = 2) -> str:
+    """Return the assumptions that affect a ranking most, and how many more there are, in one sentence.
+
+    Empty where nothing is assumed. ``assumed`` is from :func:`assumptions`.
+    """
+
+    def order(entry: str) -> int:
+        return next((n for n, word in enumerate(_BY_IMPORTANCE) if re.search(word, entry)), len(_BY_IMPORTANCE))
+
+    if not assumed:
+        return ""
+    named = list_first(sorted(assumed, key=order), count, "; ")
+    if len(named) > _LONG:
+        named = re.sub(r" \([^)]*\)", "", named)
+    return f"Assumed, not measured: {named}."
 
 
 def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]) -> list[str]:

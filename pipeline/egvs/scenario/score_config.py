@@ -14,7 +14,7 @@ from pydantic import (
     model_validator,
 )
 
-from egvs.core import plugins
+from egvs.core import limits, plugins
 from egvs.scenario.fields import Name, NotNegative, Point2, Positive, StrictModel, find_duplicates
 
 VehicleClass = Literal[
@@ -130,9 +130,11 @@ def default_gamma(voxel_m: float, *, moving_occlusion: bool) -> float:
 
 
 def _check_polygon(polygon_m: tuple[Point2, ...]) -> tuple[Point2, ...]:
-    """Return the corners of a polygon; ValueError when they enclose no area."""
+    """Return the corners of a polygon; ValueError when they are too many or enclose no area."""
     import shapely
 
+    if len(polygon_m) > limits.CORNERS.maximum:
+        raise ValueError(f"got {len(polygon_m):,} corners. {limits.CORNERS.hint}")
     reason = shapely.is_valid_reason(shapely.Polygon(polygon_m))
     if reason != "Valid Geometry":
         raise ValueError(f"expected a polygon that encloses an area ({reason})")

@@ -15,7 +15,7 @@ ASSUMED_PLANS = "signal plans"
 
 Movements = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)]
 
-_PLAN_KEYS = ("type", "cycle_s", "yellow_s", "all_red_s", "phases")
+_PLAN_KEYS = ("all_red_s", "cycle_s", "phases", "type", "yellow_s")
 """Keys that a program in a SUMO file sets itself."""
 
 
@@ -90,14 +90,14 @@ class SignalConfig(StrictModel):
         if (self.file is None) == (not self.phases):
             raise ValueError(f"expected either phases or file, got {'both' if self.phases else 'none'}")
         if self.is_sumo_file:
-            unused = sorted(self.model_fields_set & set(_PLAN_KEYS))
+            unused = [key for key in _PLAN_KEYS if getattr(self, key) != type(self).model_fields[key].default]
             if unused:
                 raise ValueError(f"{', '.join(unused)} has no effect with a <tlLogic> file. Change it there")
         if self.type == "actuated" and self.cycle_s is not None:
             raise ValueError("cycle_s has no effect with actuated signals. Remove it")
         if self.type == "fixed":
             for phase in self.phases:
-                unused = sorted(phase.model_fields_set & {"min_green_s", "max_green_s"})
+                unused = [key for key in ("max_green_s", "min_green_s") if getattr(phase, key) is not None]
                 if unused:
                     raise ValueError(f'{", ".join(unused)} has no effect with a fixed plan. Set type = "actuated"')
         return self

@@ -232,9 +232,7 @@ class TrafficConfig(StrictModel):
     recorded tracks.
     """
 
-    network: str | None = Field(
-        None, description="SUMO network (.net.xml, .net.xml.gz) or OpenStreetMap file; may start with $SUMO_HOME/"
-    )
+    network: str | None = Field(None, description="SUMO network (.net.xml, .net.xml.gz); may start with $SUMO_HOME/")
     periods: tuple[PeriodConfig, ...] = Field(
         (), description="Parts of the day with traffic of their own, mixed by their weights and scored one by one"
     )

@@ -208,14 +208,14 @@ def _site_rows(scenario: Scenario, path: Path) -> tuple[Iterable[SiteRow], list[
         world = geolocation.scenario_georeference(scenario)
         if path.suffix.lower() in (".geojson", ".json") or vector_files.is_gis_file(path):
             is_kml = path.suffix.lower() in vector_files.KML_SUFFIXES
-            return site_files.read_features(path, world, has_relief=is_kml and _has_relief(scenario)), []
+            return site_files.read_features(path, world, has_relief=is_kml and has_relief(scenario)), []
         return site_files.read_table(path, world)
     if config.grid is not None:
         return _grid_rows(config.grid), []
     return _line_rows(config.along), []
 
 
-def _has_relief(scenario: Scenario) -> bool:
+def has_relief(scenario: Scenario) -> bool:
     """Whether the ground is elsewhere than at z = 0."""
     if scenario.statics.terrain is not None:
         return True

@@ -57,6 +57,7 @@ _PEDESTRIAN = "pedestrian"
 
 _MAP_ROOTS = ("osm", "OpenDRIVE")  # of OpenStreetMap and Lanelet2, and of OpenDRIVE
 _HINT = "Use a network that netconvert wrote."
+_MAX_PHASE_S = 1e9
 # pairs of their edges are far below any limit
 _FEW_POINTS = 200
 
@@ -484,7 +485,18 @@ class _Phase(NamedTuple):
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, str]) -> _Phase:
-        return cls(float(attributes.get("maxDur", attributes["duration"])), attributes.get("state", ""))
+        duration_s = parse_phase_s("duration", attributes["duration"])
+        if "maxDur" in attributes:
+            duration_s = parse_phase_s("maxDur", attributes["maxDur"])
+        return cls(duration_s, attributes.get("state", ""))
+
+
+def parse_phase_s(key: str, text: str) -> float:
+    """Return a duration of a phase of a signal; ValueError where SUMO would reject it."""
+    value = float(text)
+    if not 0.0 <= value <= _MAX_PHASE_S or (key == "duration" and value == 0.0):
+        raise ValueError(f"{key} = {text[:80]!r}: expected seconds, above 0")
+    return value
 
 
 def _longest_reds(phases: Sequence[_Phase]) -> dict[int, float]:

@@ -111,8 +111,13 @@ class Program:
         """Parse a ``<tlLogic>``."""
         phases = []
         for phase in element.iter("phase"):
-            limits = [float(phase.attrib[key]) if key in phase.attrib else None for key in ("minDur", "maxDur")]
-            phases.append(Phase(float(phase.attrib["duration"]), phase.attrib["state"], *limits))
+            duration_s = network.parse_phase_s("duration", phase.attrib["duration"])
+            limits_s = {
+                key: network.parse_phase_s(key, phase.attrib[key])
+                for key in ("minDur", "maxDur")
+                if key in phase.attrib
+            }
+            phases.append(Phase(duration_s, phase.attrib["state"], limits_s.get("minDur"), limits_s.get("maxDur")))
         params = tuple(
             (param.attrib["key"], param.attrib["value"])
             for param in element.iterfind("param")
