@@ -555,6 +555,7 @@ def test_says_that_time_limit_was_reached(three_candidates: Path, tmp_path: Path
 def test_rule_that_forbids_one_more_is_named(five_candidates: Path, out: Path, run_egvs) -> None:
     """Three candidates at two poles, one sensor for each pole: the explorer recommends no third one either."""
     rules = ("--set", "placement.most_per_pole=1", "--set", "placement.excluded=['c', 'd']")
+    assert run_egvs("run", five_candidates, "--out", out, *rules)[0] == 0
     code, text, error = run_egvs("place", five_candidates, "--out", out, "--count", 3, *rules)
     assert code == 0, error
     assert "most_per_pole = 1 forbids a third sensor beside them." in text and "adds nothing" not in text

@@ -450,10 +450,11 @@ def test_warns_about_a_rated_range_without_its_reflectivity(street: Path) -> Non
 def test_check_command_without_findings_writes_nothing(street: Path, run_egvs) -> None:
     before = sorted(street.rglob("*"))
     code, printed, _ = run_egvs("check", street)
-    assert (code, printed.splitlines()) == (
-        0,
-        ["no errors or warnings", "checked 2 sites, 3 solids and 2 lanes"],
-    )
+    _, *poles, _, verdict, counts = printed.splitlines()
+    assert (code, verdict, counts) == (0, "no errors or warnings", "checked 2 sites, 3 solids and 2 lanes")
+    assert [line.split()[:5] for line in poles] == [
+        ["pole_a", "10.0", "12.0", "8.8", "5.7"], ["pole_b", "30.5", "-12.0", "8.8", "21.1"],
+    ]  # fmt: skip
     assert sorted(street.rglob("*")) == before
 
 
