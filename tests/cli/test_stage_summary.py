@@ -51,7 +51,7 @@ def test_one_line_says_how_many_warnings_there_are_and_shows_the_most_serious(
         assert lines[0].startswith("5 warnings; the most serious: scenario.toml: a problem of overlaps in roi")
         assert len(lines) == 2
         assert max(map(len, lines)) <= 100
-    assert report_warnings(capsys, "done", "weights")[0].startswith("1 warning: scenario.toml: a problem of weights")
+    assert report_warnings(capsys, "done", "weights")[0].startswith("warning: scenario.toml: a problem of weights")
     details = report_warnings(capsys, "done", *rules, with_details=True)
     assert len(details) == 5
     assert all(line.endswith("Do something.") for line in details)

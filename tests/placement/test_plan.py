@@ -488,21 +488,15 @@ def test_very_large_gamma_counts_every_beam(three_candidates: Path, tmp_path: Pa
     assert [sensor.site for sensor in plans[0].sensors] == [sensor.site for sensor in plans[1].sensors]
 
 
-def test_curve_shows_costs(three_candidates: Path, tmp_path: Path, run_egvs) -> None:
+def test_plan_shows_costs(three_candidates: Path, tmp_path: Path, run_egvs) -> None:
     arguments = ("place", three_candidates, "--out", tmp_path / "out", "--count", 2)
     _, text, _ = run_egvs(*arguments, "--set", "costs.pole=7")
-    header, first, second = _curve_lines(text)
-    assert header[-2:] == ["cost", "sites"]
-    curve, _ = parquet.read_artefact(tmp_path / "out" / "curve.parquet", "curve")
-    for row, line in zip(curve.to_pylist(), (first, second), strict=True):
-        names = ", ".join(json.loads(row["sites"])).split()
-        assert line[-len(names) - 1 :] == [f"{row['cost']:g}", *names]
-
-
-def _curve_lines(text: str) -> list[list[str]]:
     lines = [line.split() for line in text.splitlines()]
-    start = next(i for i, line in enumerate(lines) if line[:1] == ["sensors"])
-    return lines[start : start + 3]
+    header = next(number for number, line in enumerate(lines) if line[:1] == ["site"])
+    assert lines[header][-1] == "cost"
+    placement, _ = parquet.read_artefact(tmp_path / "out" / "placement.parquet", "placement")
+    costs = [(row["site"], f"{row['cost']:g}") for row in placement.to_pylist()]
+    assert [(line[1], line[-1]) for line in lines[header + 1 : header + 3]] == costs
 
 
 @pytest.mark.slow

@@ -116,8 +116,8 @@ def run(
         record = run_all(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
-    if not screen.any_stage_ran:
-        screen.say("no stage ran: no input has changed since the last run")
+        if not screen.any_stage_ran:
+            screen.say("no stage ran: no input has changed since the last run")
     if all_:
         run_tables.print_scores(folder, loaded, record, before_answer=True)
     if verbose:

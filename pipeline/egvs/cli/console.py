@@ -243,7 +243,7 @@ class ProgressDisplay:
         if new and not self._with_details:
             from egvs.report.reliability import by_severity
 
-            count = "1 warning" if len(new) == 1 else f"{len(new)} warnings; the most serious"
+            count = "warning" if len(new) == 1 else f"{len(new)} warnings; the most serious"
             yield from wrap_lines(f"{count}: {by_severity(new)[0]}", _WARNING_LINES)
         if known := len(self._warnings) - len(new):
             yield f"{number_of(known, 'warning')}, as in the run"
