@@ -205,6 +205,17 @@ def test_headline_names_the_best_site_and_the_lead(plain_run):
     assert f"leads the next site, {rows[1]['site']}, by {100 * (1 - rows[1]['egvs'] / rows[0]['egvs']):.1f} %" in text
 
 
+def test_says_which_losses_of_returns_are_simulated(plain_run, tmp_path):
+    scenario, out, text = plain_run
+    shutil.copytree(out, tmp_path / "out")
+    record = make_record()
+    summary = {"sites": 4, "solids": 3, "lanes": 0, "losses": ["losses are simulated for small (17 m)"]}
+    record["stages"]["check"] = record["stages"]["tpog"] | {"summary": summary}
+    (tmp_path / "out" / "run.json").write_text(json.dumps(add_checksum(record)))
+    assert "Losses are simulated for small (17 m)." in render_report(scenario, tmp_path / "out")
+    assert "losses are simulated" not in text.lower()
+
+
 def test_shows_the_record_of_the_run(plain_run):
     text = PageReader(plain_run[2]).text
     for visible_row in (

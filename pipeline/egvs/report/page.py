@@ -232,6 +232,8 @@ def dependencies(work: StageContext) -> StageDependencies:
     costs = {name: [stage.cost.seconds, stage.cost.peak_mb] for name, stage in stages.items()}
     warnings = [stage.summary.get(WARNINGS_KEY, []) for stage in stages.values()]
     more = {"costs": costs, "summaries": summaries, "warnings": warnings}
+    if "check" in stages:
+        more["losses"] = stages["check"].summary.get("losses", [])
     more["sections"] = section_dependencies(work.folder, scenario, stages)
     return StageDependencies(settings, hashes, more, section_modules())
 
