@@ -1,11 +1,12 @@
 """What losses of returns change in the shipped scenarios, for which sensors they act, and what they cost.
 
 ``python -m benchmarks.losses [SCENARIO...]`` runs each scenario twice: with the rule that decides on losses
-(:func:`egvs.sensors.return_model.decide_losses`), and with ``effects.range_limit = false``. It prints, as tables of
-``docs/effects.md``, the sensors of each scenario and the decision; the largest shares found and noticed, the best site
-and the rank correlation, without and with losses; and what the scores of some sites cost with losses, in multiples of
-that without, timed in turns. Then, for each scenario, which sensors of the catalogue would not need losses, which needs
-no run. ``--sensors NAME,NAME`` (or ``all``) repeats the first table for :data:`SENSOR_SCENARIO` with each sensor at all
+(:func:`egvs.sensors.return_model.decide_losses`), and with ``effects.range_limit = false``. It prints as tables the
+sensors of each scenario and the decision; the largest shares found and noticed, the best site and the rank correlation,
+without and with losses, and what the scores of some sites cost with losses, in multiples of that without, timed in
+turns (kept in ``docs/data/losses_in_scenarios.csv``). Then, for each scenario, which sensors of the catalogue would not
+need losses, which needs no run. ``--sensors NAME,NAME`` (or ``all``) repeats the first table for
+:data:`SENSOR_SCENARIO` with each sensor at all
 sites.
 """
 

@@ -1,7 +1,7 @@
 """Processor time of every command: cold, warm, and up to date.
 
-``python -m benchmarks.verbs --markdown docs/scaling.md`` measures the commands of :data:`VERBS` on the shipped
-roundabout with few frames, or on a small OpenStreetMap extract, and writes the table between the marks of the page.
+``python -m benchmarks.verbs --csv docs/data/command_times.csv`` measures the commands of :data:`VERBS` on the shipped
+roundabout with few frames, or on a small OpenStreetMap extract, and writes the table, which docs/scaling.md shows.
 With names of commands, it measures those and replaces their rows; the other rows stay.
 
 - *cold*: no kernel is compiled, and the store is empty
@@ -9,13 +9,14 @@ With names of commands, it measures those and replaces their rows; the other row
 - *up to date*: the same command again in the same folder, for commands that keep their results
 
 Each command runs in a fresh copy of a folder with what it needs, for example a finished run. Seconds are processor
-time of the process and of those that it started. A command whose libraries are not installed is left out; a line below
-the table names all commands without a row.
+time of the process and of those that it started. A command that was not measured has an empty row, for example because
+its libraries are not installed.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import os
 import shutil
 import signal
@@ -23,15 +24,13 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from tests.extensions.hardware.installation.simulated_scan import simulate_scan
 
-from benchmarks import page_tables
-from benchmarks.page_tables import Cells
 from benchmarks.simulated_sweeps import Truth, simulate_sweep
 from egvs.extensions.hardware.installation.planned_sites import PlannedSites
 from egvs.formats import point_clouds
@@ -40,7 +39,6 @@ from egvs.sensors.sensor import CATALOGUE
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = ROOT / "scenarios" / "roundabout"
 EXTRACT = ROOT / "tests" / "creation" / "data" / "small.osm"
-MARKS = ("<!-- verbs -->", "<!-- end of verbs -->")
 HEADINGS = ("command", "cold s", "warm s", "up to date s")
 
 REPEATS = 3
@@ -225,10 +223,10 @@ class Row:
     warm_s: float
     up_to_date_s: float | None
 
-    def cells(self) -> Cells:
+    def cells(self) -> list[str]:
         """Return the row as text."""
         up_to_date = "-" if self.up_to_date_s is None else f"{self.up_to_date_s:.2f}"
-        return f"`egvs {self.verb.command_line}`", f"{self.cold_s:.2f}", f"{self.warm_s:.2f}", up_to_date
+        return [f"egvs {self.verb.command_line}", f"{self.cold_s:.2f}", f"{self.warm_s:.2f}", up_to_date]
 
 
 def measure(verb: Verb, prepared: Path, work: Path) -> Row:
@@ -257,35 +255,18 @@ def _copy(folder: Path, to: Path) -> Path:
     return Path(shutil.copytree(folder, to, symlinks=True))
 
 
-def merge_rows(table: str, measured: Iterable[Row]) -> list[Cells]:
-    """Return the rows of a table with new measurements, in the order of :data:`VERBS`.
-
-    Parameters
-    ----------
-    table
-        The earlier table in Markdown. Rows of commands that are no longer measured in this form are dropped.
-    measured
-        New rows; each replaces that of the same command.
-    """
-    old = page_tables.read_rows(table, len(HEADINGS))
-    rows = {cells[0]: cells for cells in page_tables.merge_rows(old, [row.cells() for row in measured])}
-    commands = (f"`egvs {verb.command_line}`" for verb in VERBS)
-    return [rows[command] for command in commands if command in rows]
-
-
-def markdown(rows: Sequence[Cells]) -> str:
-    """Return the rows as a Markdown table, with a sentence about the commands of :data:`VERBS` that have none."""
-    text = page_tables.format_table(HEADINGS, rows)
-    commands = {cells[0] for cells in rows}
-    missing = [f"`egvs {verb.name}`" for verb in VERBS if f"`egvs {verb.command_line}`" not in commands]
-    if missing:
-        text += f"\n\nNot measured: {', '.join(missing)}."
-    return text
-
-
-def update_page(page: Path, measured: Iterable[Row]) -> None:
-    """Replace the rows of the measured commands in the table between the marks of a page."""
-    page_tables.replace_between(page, MARKS, lambda table: markdown(merge_rows(table, measured)))
+def update_table(path: Path, measured: Iterable[Row]) -> None:
+    """Replace the rows of measured commands in a table, which has a row for each of :data:`VERBS`, in this order."""
+    old: list[list[str]] = []
+    if path.exists():
+        with path.open(encoding="utf-8", newline="") as file:
+            old = list(csv.reader(file))[1:]
+    rows = {row[0]: row for row in [*old, *(row.cells() for row in measured)]}
+    commands = [f"egvs {verb.command_line}" for verb in VERBS]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(
+            [HEADINGS, *(rows.get(command, [command, "", "", ""]) for command in commands)]
+        )
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -294,9 +275,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "verbs", nargs="*", metavar="VERB", help='names of commands, for example "city run"; all if none'
     )
-    parser.add_argument(
-        "--markdown", type=Path, metavar="FILE", help="replace the rows of these commands in the table of this page"
-    )
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="replace the rows of these commands in this table")
     chosen = parser.parse_args(arguments)
     known = [verb.name for verb in VERBS]
     unknown = set(chosen.verbs) - set(known)
@@ -317,8 +296,8 @@ def main(arguments: list[str] | None = None) -> None:
                 continue
             print(*rows[-1].cells(), sep="   ", flush=True)
             shutil.rmtree(folder / str(number))
-            if chosen.markdown is not None:
-                update_page(chosen.markdown, rows[-1:])
+            if chosen.csv is not None:
+                update_table(chosen.csv, rows[-1:])
     if left_out:
         print(f"left out: {', '.join(left_out)}")
 

@@ -7,6 +7,7 @@ exits with 1 if a decision differs from exact arithmetic.
 from __future__ import annotations
 
 import argparse
+import csv
 import sys
 import time
 from pathlib import Path
@@ -27,17 +28,19 @@ def cells(row: Row) -> tuple[str, ...]:
     return row.case, row.rule, row.tested, f"{row.cases:,}", f"{row.excluded:,}", f"{row.mismatches:,}", row.worst
 
 
-def markdown(rows: list[Row]) -> str:
-    """The rows as a Markdown table."""
-    lines = [HEADINGS, ("---",) * 3 + ("---:",) * 3 + ("---",), *(cells(row) for row in rows)]
-    return "".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |\n" for line in lines)
+def write_csv(path: Path, rows: list[Row]) -> None:
+    """Write the rows as a table of the documentation."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(HEADINGS)
+        writer.writerows((r.case, r.rule, r.tested, r.cases, r.excluded, r.mismatches, r.worst) for r in rows)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run all checks, and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.numerics", description=__doc__)
     parser.add_argument("--scale", type=float, default=1.0, help="share of the full length (default 1)")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table there too")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write the table there too")
     chosen = parser.parse_args(arguments)
     if not 0 < chosen.scale <= 100:
         parser.error(f"--scale {chosen.scale:g}: a number above 0, at most 100")
@@ -51,8 +54,8 @@ def main(arguments: list[str] | None = None) -> int:
     for row in rows:
         table.add_row(*cells(row), style="red" if row.mismatches else None)
     console.print(table)
-    if chosen.markdown is not None:
-        chosen.markdown.write_text(markdown(rows), encoding="utf-8")
+    if chosen.csv is not None:
+        write_csv(chosen.csv, rows)
     for name, part in by_module.items():
         console.print(
             f"{name}: {sum(row.mismatches for row in part)} mismatches in {sum(row.cases for row in part):,} cases"

@@ -1,5 +1,5 @@
 """Add to the documentation site what comes from the program: the diagram of the packages, tables of public names
-and of study results, a reference page for each package, the notebooks, and formulas as MathML."""
+and of data, a reference page for each package, the notebooks, and formulas as MathML."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _VIEW = ROOT / "build" / "view.html"
 """The 3D view of a run, which `make docs` writes. Without it, the first page links to docs/explore.md."""
 _LINK_WITHOUT_VIEW = "](explore.md#one-file-to-share)"
 _ELSEWHERE = "https://unpkg.com/iframe-worker/shim"
-_INSERT = re.compile(r"<!-- (names of|picture of|study conditions|study table) ([\w-]+) -->")
+_INSERT = re.compile(r"<!-- (names of|picture of|data table) ([\w-]+) -->")
 
 
 def on_config(config: MkDocsConfig) -> None:
@@ -55,6 +55,9 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         files.append(File.generated(config, _VIEW.name, abs_src_path=str(_VIEW)))
 
 
+_EXAMPLE = re.compile(r"^\[`([^`]+)`\]\((examples/[^)]+)\)$", re.MULTILINE)
+"""A link to a file of an example, alone in its line: the site shows the file itself."""
+
 _PICTURE = re.compile(r"<!-- picture of packages -->.*?<!-- end of picture -->", re.DOTALL)
 """The picture as text, for readers of the file; the site has a drawing of the imports in its place."""
 
@@ -66,14 +69,18 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         if _LINK_WITHOUT_VIEW not in markdown:
             raise ValueError(f"docs/index.md has no picture with the link {_LINK_WITHOUT_VIEW}")
         markdown = markdown.replace(_LINK_WITHOUT_VIEW, f"]({_VIEW.name})")
-    if page.file.src_uri == "validity-tables.md":
-        shown = {name for what, name in _INSERT.findall(markdown) if what == "study table"}
-        if missing := tables.study_files() - shown:
-            raise ValueError(f"docs/validity-tables.md does not show {', '.join(sorted(missing))}")
     markdown = _PICTURE.sub("<!-- picture of packages -->", markdown)
+    markdown = _EXAMPLE.sub(_show_file, markdown)
     if page.file.src_uri == "notebooks/index.md":
         markdown = notebooks.gallery(markdown)
     return notebooks.link_pages(_INSERT.sub(lambda m: _MAKE[m[1]](m[2]), markdown))
+
+
+def _show_file(link: re.Match[str]) -> str:
+    """Return a block of code with the content of a linked file."""
+    name, path = link.groups()
+    language = {"py": "python", "j2": "html"}.get(suffix := name.rpartition(".")[2], suffix)
+    return f'```{language} title="{name}"\n{(ROOT / "docs" / path).read_text(encoding="utf-8")}```'
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -105,6 +112,5 @@ def _first_line(path: Path) -> str:
 _MAKE = {
     "names of": tables.names,
     "picture of": lambda _: package_diagram.picture(),
-    "study conditions": tables.study_conditions,
-    "study table": tables.study_tables,
+    "data table": tables.data_table,
 }

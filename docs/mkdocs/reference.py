@@ -1,7 +1,8 @@
-"""Write the reference pages of the documentation: every scenario key, artefact column and module, as Markdown.
+"""Write the reference pages of the documentation: every scenario key, artefact column, limit and module, as Markdown.
 
-``make reference`` writes ``docs/scenario-keys.md`` and ``docs/columns.md`` from the schemas in ``data_schemas/``, and
-``docs/modules.md`` from the docstrings of modules. A test fails when the pages are out of date. Only the standard
+``make reference`` writes ``docs/scenario-keys.md`` and ``docs/columns.md`` from the schemas in ``data_schemas/``,
+``docs/limits.md`` from ``egvs.core.limits``, and ``docs/modules.md`` from the docstrings of modules. A test fails when
+the pages are out of date. Only the standard
 library is used, so any Python runs this file.
 """
 
@@ -38,6 +39,16 @@ CITY_HEAD = """\
 
 The keys of a [city](city.md). Its tables, such as `[traffic]` and `[effects.<name>]`, have the same keys as in a
 scenario.
+"""
+LIMITS_HEAD = """\
+# Every limit of input
+
+`make reference` writes this page from `egvs.core.limits`. A limit only rejects input; it never changes a result. To
+raise one, set the variable of its name to a whole number: `EGVS_MAX_POINTS=100000000 egvs run ...`.
+[Security](security.md#limits-by-format) says which limits apply to which format.
+
+| variable | default | applies to |
+|---|---|---|
 """
 MODULES_HEAD = """\
 # Every module
@@ -82,6 +93,7 @@ def pages() -> dict[Path, str]:
     return {
         DOCS / "columns.md": columns_page(),
         DOCS / "scenario-keys.md": keys_page(),
+        DOCS / "limits.md": limits_page(),
         DOCS / "modules.md": modules_page(),
     }
 
@@ -117,6 +129,17 @@ def keys_page() -> str:
     lines = [KEYS_HEAD, *_table(scenario, scenario["$defs"], prefix="", heading="scenario.toml")]
     lines += [CITY_HEAD, *_rows(city)]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def limits_page() -> str:
+    """Each limit with its default, as a Markdown table."""
+    module = ast.parse((PACKAGE / "core" / "limits.py").read_text(encoding="utf-8"))
+    rows = []
+    for call in ast.walk(module):
+        if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "Limit":
+            name, default, unit, what = (eval(ast.unparse(value), {"__builtins__": {}}) for value in call.args)
+            rows.append(f"| `{name}` | {default if unit == 'MB' else f'{default:,}'} {unit} | {what} |\n")
+    return LIMITS_HEAD + "".join(rows)
 
 
 def modules_page() -> str:

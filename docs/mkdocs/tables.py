@@ -1,18 +1,13 @@
-"""Markdown tables for the site: the public names of a package, and the tables of the validity study."""
+"""Markdown tables for the site: the public names of a package, and files of data."""
 
 from __future__ import annotations
 
 import ast
+import csv
 import re
-import sys
-from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
-from benchmarks.across_junctions import table_files as study  # noqa: E402
-
-STUDY = ROOT / "docs" / "data" / "validity"
 
 
 def names(package: str) -> str:
@@ -39,26 +34,8 @@ def _as_code(text: str) -> str:
     return re.sub(r"(?::\w+:)?(`+)~?([^`]+)\1", r"`\2`", text).replace("|", "\\|").replace("\n", " ")
 
 
-@cache
-def _study() -> tuple[list[str], dict[str, list[study.Table]]]:
-    """Conditions of the validity study, and its tables by file."""
-    preface, tables = study.read(STUDY)
-    by_file: dict[str, list[study.Table]] = {}
-    for table, file in zip(tables, study.file_names(STUDY), strict=True):
-        by_file.setdefault(file, []).append(table)
-    return preface, by_file
-
-
-def study_conditions(_: str) -> str:
-    """Detectors, frames and seeds of the validity study."""
-    return "\n\n".join(_study()[0])
-
-
-def study_tables(stem: str) -> str:
-    """The tables of one CSV file of the validity study, each with its caption."""
-    return "\n".join(study.markdown(table) for table in _study()[1][f"{stem}.csv"])
-
-
-def study_files() -> set[str]:
-    """The CSV files of the validity study, without their suffix."""
-    return {Path(file).stem for file in _study()[1]}
+def data_table(stem: str) -> str:
+    """All rows of ``docs/data/<stem>.csv``."""
+    with (ROOT / "docs" / "data" / f"{stem}.csv").open(encoding="utf-8", newline="") as file:
+        head, *rows = csv.reader(file)
+    return "\n".join("| " + " | ".join(row) + " |" for row in [head, ["---"] * len(head), *rows])

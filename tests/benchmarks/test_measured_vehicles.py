@@ -10,7 +10,7 @@ import pytest
 from benchmarks import measured_vehicles
 from benchmarks.measured_vehicles import ELSEWHERE, LIST, LOST, ON_VEHICLE, OnVehicle, Vehicle
 
-VALIDITY = Path(measured_vehicles.__file__).parents[1] / "docs" / "validity.md"
+DOCS = Path(measured_vehicles.__file__).parents[1] / "docs"
 
 
 def on_vehicle(outcomes: list[int], cosines: list[float], measured: int = 1, simulated: int = 1) -> OnVehicle:
@@ -47,12 +47,16 @@ def test_jackknife_of_a_mean_is_its_t_interval() -> None:
     assert (share.value, share.high - share.value) == pytest.approx((2.0, 4.30265 / np.sqrt(3)), abs=1e-4)
 
 
-def test_page_agrees_with_the_list_of_vehicles() -> None:
+def test_page_and_counts_agree_with_the_list_of_vehicles() -> None:
     with LIST.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     cars = [row for row in rows if row["kind"] in ("car", "van")]
     measured = sum(int(row["points_measured"]) for row in cars)
     simulated = sum(int(row["points_simulated"]) for row in cars)
-    page = VALIDITY.read_text(encoding="utf-8")
     assert len(rows) == sum(map(len, measured_vehicles.CONFIRMED.values())) == 60
-    assert f"| all | {len(cars)} | {measured:,} | {simulated:,} | {simulated / measured:.2f} (" in page
+    ratio = f"{simulated / measured:.2f}"
+    counts = (DOCS / "data" / "measured_vehicles.csv").read_text(encoding="utf-8")
+    assert f",all,{len(cars)},{measured},{simulated},{ratio}," in counts
+    page = (DOCS / "validity.md").read_text(encoding="utf-8")
+    assert f"Cars and vans have [{ratio} (" in page
+    assert f"{100 * (simulated / measured - 1):.0f} % more points" in page

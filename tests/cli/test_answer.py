@@ -1,12 +1,20 @@
 """The answer at the end of ``egvs run``."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 import egvs
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import RunRecord
 from egvs.cli import answer
-from egvs.report import sections
+from egvs.core.errors import collect_warnings
+from egvs.report import ranking_text, sections
+from egvs.report.reliability import by_severity, describe_reliability
+from egvs.results.plans import SensorPlan
+from egvs.results.ranking import Ranking
+from tests.report.small_runs import PageReader
 from tests.results.test_ranking import by_vehicles
 
 MOUNTS = "site,x_m,y_m,z_m,pitch_deg\n" + "".join(
@@ -22,27 +30,74 @@ def six_poles(mini: Path) -> Path:
     return mini
 
 
-def test_ends_with_the_best_poles_and_the_report(six_poles: Path, tmp_path: Path, run_egvs) -> None:
-    code, printed, error = run_egvs("run", six_poles, "--out", tmp_path / "out", "--set", "score.rank_by='coverage'")
+STAGE_LINE = re.compile(r"\w+ +(\d+\.\d s|unchanged|from store) ")
+ASSUMED = ("traffic (guessed)", "signal plans", "heights of 3 trees", "positions of the poles")
+
+
+def answer_lines(printed: str, error: str) -> list[str]:
+    """Return what follows the stages: warnings, and the answer."""
+    return [line for line in error.splitlines() if line and not STAGE_LINE.match(line)] + printed.splitlines()
+
+
+def test_the_answer_has_twelve_lines(six_poles: Path, tmp_path: Path, run_egvs) -> None:
+    """With warnings, assumptions and six poles; the table has as many of them as there is room for."""
+    with (six_poles / "sites.csv").open("a") as file:
+        file.write("a_5_again,10,12,5,-10\nskywards,10,12,5,60\n")
+    out = tmp_path / "out"
+    settings = ("--out", out, "--set", f"assumed={list(ASSUMED)}", "--set", "score.rank_by='expected_detections'")
+    code, printed, error = run_egvs("run", six_poles, *settings)
     assert code == 0, error
-    lines = printed.splitlines()
-    assert lines[1].split()[1:7] == ["is", "the", "best", "of", "12", "sites:"]
-    table = [line.split() for line in lines if line[:1].isdigit() and line[1:3] == "  "]
-    assert [row[0] for row in table] == ["1", "2", "3", "4", "5"]
-    assert len({row[1] for row in table}) == 5, "each pole once"
-    shares = [float(row[row.index("%") - 1]) for row in table]
-    assert shares == sorted(shares, reverse=True)
-    assert "1 more pole: --all lists all" in printed
-    assert lines[-2] == f"Which sensor? egvs compare {tmp_path / 'out'} --sensors NAME,NAME (or all)"
-    assert lines[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
-    assert len(lines) + len(error.splitlines()) <= 25
+    lines = answer_lines(printed, error)
+    assert len(lines) <= answer.MAX_LINES
+    assert max(map(len, lines[:-1])) <= 100  # the last one has a path
+    assert len(" ".join(lines).split()) <= 200
+    rows = [line for line in lines if re.match(r"\d  ", line)]
+    assert answer.MIN_POLES <= len(rows) <= answer.DEFAULT_POLES
+    warnings = collect_warnings(stage.summary for stage in RunRecord.read(out).stages.values())
+    assert len(warnings) > 1
+    assert lines[0].startswith(f"{len(warnings)} warnings; the most serious: {by_severity(warnings)[0].where}")
+    assert "Assumed, not measured: traffic (guessed); positions of the poles and 2 more." in lines
+    assert lines[-1].startswith(f"report: {out / 'report.html'} ")
+    assert len(answer_lines(*run_egvs("run", six_poles, *settings, "--top", "6")[1:])) > len(lines)
+
+
+def test_no_fact_is_lost_in_the_report_and_with_verbose(six_poles: Path, tmp_path: Path, run_egvs) -> None:
+    """Each warning, assumption and caveat, the lead, poles and scores."""
+    with (six_poles / "sites.csv").open("a") as file:
+        file.write("a_5_again,10,12,5,-10\nskywards,10,12,5,60\n")
+    out = tmp_path / "out"
+    settings = ("--out", out, "--set", f"assumed={list(ASSUMED)}", "--set", "score.rank_by='expected_detections'")
+    code, printed, error = run_egvs("run", six_poles, *settings, "--verbose")
+    assert code == 0, error
+    record, ranked = RunRecord.read(out), Ranking.read(out / "scores.parquet")
+    scenario = egvs.load(six_poles, ["score.rank_by='expected_detections'"])
+    facts = [warning.problem for stage in record.stages.values() for warning in collect_warnings([stage.summary])]
+    facts += describe_reliability(ranked, record.traffic_summary, scenario.score.ranking_detectors)
+    facts += [*ASSUMED, ranking_text.lead(ranked), *(pole.name for pole in ranked.poles)]
+    facts += [ranked.best[0].noticed_cell, ranked.by.value(ranked.best[0].score), f"{ranked.best[0].egvs:,.0f}"]
+    assert len(facts) > 12
+    page = PageReader((out / "report.html").read_text(encoding="utf-8")).text
+    for text in (printed + error, page):
+        plain = " ".join(text.replace("\u2019", "'").replace("\u00a0", " ").split())
+        assert [fact for fact in facts if " ".join(fact.replace("\u2019", "'").split()) not in plain] == []
+
+
+def test_plans_in_one_go(six_poles: Path, tmp_path: Path, run_egvs) -> None:
+    out = tmp_path / "out"
+    code, printed, error = run_egvs("run", six_poles, "--out", out, "--count", "2")
+    assert code == 0, error
+    assert "Pole" in printed.splitlines()[0]
+    assert "\nThe plan " in printed
+    plan = SensorPlan.read(RunFolder(out))
+    assert plan is not None
+    assert len(plan.sensors) == 2
 
 
 def test_says_what_was_assumed(mini: Path, tmp_path: Path, run_egvs) -> None:
     settings = ("--set", "assumed=['traffic (guessed)', 'positions of the poles']")
     code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out", *settings)
     assert code == 0, error
-    assert "assumed, not measured: traffic (guessed); positions of the poles." in printed
+    assert "Assumed, not measured: traffic (guessed); positions of the poles." in printed
     assert "traffic (guessed); positions of the poles" in (tmp_path / "out" / "report.html").read_text()
     assert "not measured" not in run_egvs("run", mini, "--out", tmp_path / "two")[1]
 
@@ -70,6 +125,15 @@ def test_signal_plans_are_no_assumption_once_they_are_given(mini: Path) -> None:
     assert sections.describe_caveats(some, "ranking", plans=[given]) == sentence
 
 
+def test_existing_poles_are_no_assumption_and_missing_surroundings_are(mini: Path) -> None:
+    keys = ["assumed=['traffic (guessed)', 'positions of the poles']"]
+    for existing, poles in (("'all'", ()), ("['pole_a']", ("positions of the poles other than pole_a",))):
+        scenario = egvs.load(mini, [*keys, f"sites.existing_poles={existing}"])
+        assert sections.assumptions(scenario, ()) == ("traffic (guessed)", *poles)
+    bare = egvs.load(mini, [*keys, "statics.footprints=[]"])
+    assert sections.assumptions(bare, ())[2:] == ("surroundings (no building or tree is known)",)
+
+
 def test_says_that_losses_of_several_sensors_are_off_where_they_are(mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\na,10,12,5,VLP-16\nb,30.5,-12,5,VLP-32C\n")
     scenario = mini / "scenario.toml"
@@ -77,7 +141,7 @@ def test_says_that_losses_of_several_sensors_are_off_where_they_are(mini: Path, 
     folders = [str(tmp_path / name) for name in ("plain", "limited")]
     texts = []
     for folder, settings in zip(folders, (("--set", "effects.range_limit=false"), ()), strict=True):
-        code, printed, error = run_egvs("run", mini, "--out", folder, *settings)
+        code, printed, error = run_egvs("run", mini, "--out", folder, *settings, "--verbose")
         assert code == 0, error
         page = Path(folder, "report.html").read_text(encoding="utf-8")
         texts += [printed, page, run_egvs("compare", folder)[1]]

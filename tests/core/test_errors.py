@@ -44,7 +44,7 @@ def test_warning_is_printed_on_one_line(capsys) -> None:
     record = StageRecord(
         "", {}, {}, {"sites": 2, WARNINGS_KEY: [ONE.to_json()]}, ResourceUsage(seconds=1.0, peak_mb=1.0)
     )
-    ProgressDisplay().stage_event("scan", "done", record)
+    ProgressDisplay(with_details=True).stage_event("scan", "done", record)
     assert capsys.readouterr().err.splitlines()[1:] == [f"warning: {ONE}"]
 
 

@@ -81,7 +81,7 @@ def test_translate_errors_passes_other_errors(error: BaseException) -> None:
 
 
 def test_documentation_lists_every_limit() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "limits.md").read_text(encoding="utf-8")
     rows = [line for line in page.splitlines() if line.startswith("| `EGVS_MAX_")]
     defaults = {limit: str(limit.default) if limit.unit == "MB" else f"{limit.default:,}" for limit in LIMITS}
     assert rows == [f"| `{limit.name}` | {value} {limit.unit} | {limit.what} |" for limit, value in defaults.items()]

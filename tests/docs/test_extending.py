@@ -17,16 +17,16 @@ from tests import processes
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
 SMALL = Path(__file__).resolve().parents[1] / "creation" / "data" / "small.osm"
-_BLOCK = re.compile(r'^```\w+ title="([^"]+)"\n(.*?)^```$', re.DOTALL | re.MULTILINE)
+_FILE = re.compile(r"^\[`([^`]+)`\]\((examples/[^)]+)\)$", re.MULTILINE)
 _LINES = 35  # what a page of thirty lines may come to
 _CODE_LINES = 30
 
 
 def package(heading: str) -> dict[str, str]:
-    """The files that the page shows under one heading, by name."""
+    """The files of the example that the page shows under one heading, by name."""
     part = re.search(rf"^## {re.escape(heading)}\n(.*?)(?=^## |\Z)", PAGE.read_text(encoding="utf-8"), re.DOTALL | re.M)
     assert part, f"{PAGE.name} has no heading {heading!r}"
-    return dict(_BLOCK.findall(part[1]))
+    return {name: (PAGE.parent / path).read_text(encoding="utf-8") for name, path in _FILE.findall(part[1])}
 
 
 def install(files: dict[str, str], folder: Path) -> Path:
@@ -70,6 +70,7 @@ def scores(folder: Path) -> list[float]:
         ("A format of point clouds", 2),
         ("A format of recorded tracks", 2),
         ("A score", 1),
+        ("A score that ranks", 1),
         ("A command", 1),
         ("A section of the report", 1),
     ],
@@ -209,6 +210,17 @@ def test_a_score_of_another_package_is_listed(tmp_path: Path) -> None:
     assert code == 0 and "near_points" in text and "within_m 20, 50" in text and "package egvs-near-points" in text, (
         text
     )
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_a_score_of_another_package_ranks(mini: Path, tmp_path: Path) -> None:
+    beside = install(package("A score that ranks"), tmp_path / "installed")
+    words = ("--out", tmp_path / "run", "--set", "score.rank_by=half_seen")
+    code, text = run_egvs("run", mini, *words, beside=beside)
+    assert code == 0 and "half_seen" in text, text
+    code, text = run_egvs("scores", beside=beside)
+    assert code == 0 and "package egvs-half-seen" in text, text
 
 
 @pytest.mark.system

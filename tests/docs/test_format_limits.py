@@ -44,9 +44,9 @@ pytestmark = [
 def table_rows() -> dict[str, list[str]]:
     """The variables of each format, from the page."""
     page = (DOCS / "security.md").read_text(encoding="utf-8")
-    table = page.partition("| format | read by | process | limits |\n")[2].partition("\n\n")[0]
+    table = page.partition("| format | read by | limits |\n")[2].partition("\n\n")[0]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[1:]]
-    return {row[0].replace("`", ""): row[3].replace("`", "").split(", ") for row in cells}
+    return {row[0].replace("`", ""): row[2].replace("`", "").split(", ") for row in cells}
 
 
 @dataclass(frozen=True)

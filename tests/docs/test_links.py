@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -47,6 +48,17 @@ def test_links_lead_somewhere(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     problems = {target: reason for target in links(text) if (reason := problem(page, target))}
     assert not problems
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "<!-- data table" in page.read_text(encoding="utf-8")])
+def test_tables_of_data_have_a_file_and_a_link(page: Path) -> None:
+    """The site shows the table; readers of the file follow the link."""
+    text = page.read_text(encoding="utf-8")
+    for name in re.findall(r"<!-- data table (\S+) -->", text):
+        file = DOCS / "data" / f"{name}.csv"
+        assert f"({Path(os.path.relpath(file, page.parent)).as_posix()})" in text
+        table = file.read_text(encoding="utf-8")
+        assert not {target: reason for target in links(table) if (reason := problem(page, target))}
 
 
 def test_pages_have_links() -> None:

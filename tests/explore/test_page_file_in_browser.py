@@ -49,6 +49,11 @@ def count_shades(picture: np.ndarray, colour: np.ndarray) -> int:
     return int(((shade >= 0.5) & (differences <= 0.02)).sum())
 
 
+UNNAMED = """() => [...document.querySelectorAll("button, input")]
+    .filter(e => !e.ariaLabel && !e.labels.length && !e.textContent.trim()).map(e => e.outerHTML.slice(0, 200))"""
+"""Controls without a name for screen readers."""
+
+
 def test_opens_from_disk_without_network(tmp_path: Path) -> None:
     from playwright.sync_api import sync_playwright
 
@@ -69,6 +74,8 @@ def test_opens_from_disk_without_network(tmp_path: Path) -> None:
         tab.wait_for_function("window.__viserSceneTree?.getState()['/traffic/returns'] !== undefined")
         tab.wait_for_function(f"({VISIBLE})().join() === '/layers/blindspots'")
         assert tab.locator("#egvs").get_attribute("data-theme") == "dark"
+        assert tab.locator("main, [role=main]").count() == tab.locator("h1").count() == 1
+        assert tab.evaluate(UNNAMED) == []
         tab.get_by_label("entropy seen").check()
         tab.wait_for_function(f"({VISIBLE})().join() === '/layers/seen'")
         tab.get_by_label("none").check()

@@ -19,6 +19,7 @@ from egvs.formats import georeference
 from egvs.formats.georeference import (
     WGS84,
     WORLD,
+    CoordinateReading,
     Georeference,
     WorldFrame,
     declared_crs,
@@ -385,3 +386,9 @@ def test_a_local_system_in_feet_is_converted_to_metres() -> None:
     roi = Roi((0.0, 0.0, 0.0), (10.0, 10.0, 5.0))
     reading = Georeference(None, roi, "scenario.toml").read_coordinates(np.array([[10.0, 20.0]]), "a.las", local)
     np.testing.assert_allclose(reading.to_world(np.array([[10.0, 20.0]])), [[3.048, 6.096]])
+
+
+def test_rejects_coordinates_too_large_to_be_rounded() -> None:
+    reading = CoordinateReading("metres", lambda xy: xy, "a.shp")
+    with pytest.raises(InputError, match=r"a\.shp: \(-2e\+304, 5\) cannot be converted from metres"):
+        reading.to_world(np.array([[1.0, 2.0], [-2e304, 5.0]]))

@@ -167,6 +167,17 @@ def test_las_with_wkt_before_or_behind_the_points(tmp_path: Path) -> None:
         assert height_unit(crs, "").metres == pytest.approx(SURVEY_FOOT_M)
 
 
+@pytest.mark.parametrize("start", [2**62, 2**64 - 1])
+def test_records_far_behind_the_file_are_none(tmp_path: Path, start: int) -> None:
+    """Some file systems reject such a position."""
+    path = write_las(tmp_path / "a.las", keys=UTM_15, wkt=WKT_UTM_FEET, wkt_is_behind=True)
+    data = bytearray(path.read_bytes())
+    data[235:243] = start.to_bytes(8, "little")
+    path.write_bytes(data)
+    crs = point_cloud_crs(path, "")
+    assert crs is not None and height_unit(crs, "").metres == 1.0
+
+
 def test_flag_of_the_header_says_which_record_counts(tmp_path: Path) -> None:
     both: dict[str, Any] = {"keys": UTM_15, "wkt": WKT_UTM_FEET}
     assert point_cloud_crs(write_las(tmp_path / "a.las", **both, wkt_flag=True), "") == WKT_UTM_FEET

@@ -13,7 +13,7 @@ from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan
 from egvs.formats import workbooks
 from egvs.formats.spreadsheets import parse_rows, read_rows
-from tests.formats.workbooks import encrypted_workbook, write_ods, write_xlsx
+from tests.formats.workbooks import encrypted_workbook, write_ods, write_xls, write_xlsx
 
 Row = tuple[str, dict[str, str]]
 
@@ -193,11 +193,28 @@ def test_damaged_workbook(tmp_path: Path, content: bytes) -> None:
         read(path)
 
 
-@pytest.mark.system
-def test_errors_of_formulas_are_not_empty_cells(tmp_path: Path) -> None:
-    path = tmp_path / "t.xlsx"
-    write_xlsx(path, {"Other": (("x", "#REF!"),), "Sites": (("a", "b"), ("k", "#DIV/0!"))}, hidden=("Other",))
-    assert read(path) == [(f"{path}: row 2", {"a": "k", "b": "#DIV/0!"})]
+@pytest.mark.parametrize(
+    "suffix", [pytest.param(suffix, marks=pytest.mark.system) for suffix in ("xlsx", "ods", "xls")] + ["csv"]
+)
+def test_errors_of_formulas_are_named_in_any_column(tmp_path: Path, suffix: str) -> None:
+    """A reader would see an empty cell, or 0."""
+    path = tmp_path / f"t.{suffix}"
+    rows = [("site", "x_m", "note"), ("k1", "#DIV/0!", "No. 1"), ("k2", 1.5, "#REF!"), ("k3", "#REF!", "#DIV/0!")]
+    if suffix == "xlsx":
+        write_xlsx(path, {"Other": (("x", "#REF!"),), "Sites": rows}, ["Other"])
+    elif suffix == "csv":
+        path.write_text("\n".join(",".join(map(str, row)) for row in rows))
+    else:
+        (write_ods if suffix == "ods" else write_xls)(path, rows)
+    table = read_rows(path, lambda names: names)
+    row = f"{path}: {'line' if suffix == 'csv' else 'row'}"
+    assert table.rows == []
+    assert [str(error) for error in table.errors] == [
+        f"{row} 2: x_m: expected a value, got the formula error #DIV/0!. Correct the formula.",
+        f"{row} 3: note: expected a value, got the formula error #REF!. Correct the formula.",
+        f"{row} 4: x_m: expected a value, got the formula error #REF!. Correct the formula.",
+        f"{row} 4: note: expected a value, got the formula error #DIV/0!. Correct the formula.",
+    ]
 
 
 @pytest.mark.system
@@ -234,21 +251,71 @@ def test_rejects_cells_that_a_reader_cannot_see(tmp_path: Path, before: str, aft
 
 
 @pytest.mark.system
-def test_formula_without_a_value_is_no_empty_cell(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("cell", "value"),
+    [("<f>1+1</f>", None), ("<f>1+1</f><v>2</v>", "2"), ("<f>1+1</f><v></v>", None)],
+)
+def test_formula_without_a_value_is_no_empty_cell(tmp_path: Path, cell: str, value: str | None) -> None:
     """Programs that write workbooks do not compute."""
-    path = _edited_workbook(tmp_path, "<c r='B2'><v>2</v></c>", "<c r='B2'><f>1+1</f></c>")
-    assert read(path)[0][1] == {"a": "1", "b": "a formula without a value"}
-    path = _edited_workbook(tmp_path, "<c r='B2'><v>2</v></c>", "<c r='B2'><f>1+1</f><v>2</v></c>")
-    assert read(path)[0][1] == {"a": "1", "b": "2"}
+    path = _edited_workbook(tmp_path, "<c r='B2'><v>2</v></c>", f"<c r='B2'>{cell}</c>")
+    if value is not None:
+        assert read(path)[0][1] == {"a": "1", "b": value}
+    else:
+        (error,) = read_rows(path, list).errors
+        assert str(error) == (
+            f"{path}: row 2: b: a formula without a value. Open the table in a spreadsheet program, and save it."
+        )
+
+
+@pytest.mark.system
+def test_formula_may_give_an_empty_text(tmp_path: Path) -> None:
+    path = _edited_workbook(tmp_path, "<c r='B2'><v>2</v></c>", "<c r='B2' t='str'><f>IF(A1>1,2,\"\")</f><v></v></c>")
+    assert read(path)[0][1] == {"a": "1", "b": ""}
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        (" office:value-type='string'><text:p>x</", " table:number-rows-spanned='2'><text:p>x</",
+         "sheet 'a': the cells of rows 2 to 3 and columns 1 to 1 are merged. Unmerge them"),
+        ("<table:table-row><table:table-cell office:value-type='string'><text:p>x</",
+         "<table:table-row table:visibility='filter'><table:table-cell office:value-type='string'><text:p>x</",
+         "sheet 'a': rows with values are hidden: 2. Show or delete them."),
+    ],
+)  # fmt: skip
+def test_rejects_cells_of_open_documents_that_a_reader_cannot_see(
+    tmp_path: Path, before: str, after: str, message: str
+) -> None:
+    plain, path = tmp_path / "plain.ods", tmp_path / "t.ods"
+    write_ods(plain, [("a", "b"), ("x", 1.5), ("y", 2.5)])
+    _edit_archive(plain, path, before, after)
+    with pytest.raises(InputError) as caught:
+        read(path)
+    assert message in str(caught.value)
+
+
+@pytest.mark.system
+def test_rejects_hidden_rows_of_excel_97(tmp_path: Path) -> None:
+    path = tmp_path / "t.xls"
+    write_xls(path, [("a", "b"), ("x", 1.5), ("y", 2.5)])
+    assert [cells for _, cells in read(path)] == [{"a": "x", "b": "1.5"}, {"a": "y", "b": "2.5"}]
+    write_xls(path, [("a", "b"), ("x", 1.5), ("y", 2.5)], hidden=[2])
+    with pytest.raises(InputError, match=r"sheet 'a': rows with values are hidden: 3\. Show or delete them"):
+        read(path)
 
 
 def _edited_workbook(folder: Path, before: str, after: str) -> Path:
     plain, path = folder / "plain.xlsx", folder / "t.xlsx"
     write_xlsx(plain, {"a": (("a", "b"), (1, 2), (3, 4))})
-    with zipfile.ZipFile(plain) as old, zipfile.ZipFile(path, "w") as new:
+    _edit_archive(plain, path, before, after)
+    return path
+
+
+def _edit_archive(source: Path, target: Path, before: str, after: str) -> None:
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
         for name in old.namelist():
             new.writestr(name, old.read(name).decode().replace(before, after))
-    return path
 
 
 @pytest.mark.system

@@ -1,4 +1,4 @@
-"""Small workbooks (xlsx, ods), written as spreadsheet programs write them."""
+"""Small workbooks (xlsx, ods, xls), written as spreadsheet programs write them."""
 
 from __future__ import annotations
 
@@ -66,9 +66,10 @@ def _xlsx_cell(value: Cell, row: int, column: int) -> str:
 
 
 def write_ods(path: Path, rows: Rows) -> None:
-    """Write a workbook with one sheet of texts and numbers."""
+    """Write a workbook with one sheet of texts and numbers; texts with a # are errors, and None is merged."""
     lines = "".join(f"<table:table-row>{''.join(map(_ods_cell, cells))}</table:table-row>" for cells in rows)
     names = {name: f"urn:oasis:names:tc:opendocument:xmlns:{name}:1.0" for name in ("office", "table", "text")}
+    names["calcext"] = "urn:org:documentfoundation:names:experimental:calc:xmlns:calcext:1.0"
     spaces = " ".join(f"xmlns:{name}='{uri}'" for name, uri in names.items())
     sheet = f"<office:spreadsheet><table:table table:name='a'>{lines}</table:table></office:spreadsheet>"
     with zipfile.ZipFile(path, "w") as archive:
@@ -80,19 +81,52 @@ def write_ods(path: Path, rows: Rows) -> None:
 
 def _ods_cell(value: Cell) -> str:
     if isinstance(value, str):
-        text = f"<text:p>{escape(value)}</text:p>"
-        return f"<table:table-cell office:value-type='string'>{text}</table:table-cell>"
+        kind = "office:value-type='string'"
+        if value.startswith(("#", "Err:")):  # as LibreOffice writes them
+            kind = "table:formula='of:=x' office:value-type='float' office:value='0' calcext:value-type='error'"
+        return f"<table:table-cell {kind}><text:p>{escape(value)}</text:p></table:table-cell>"
     return f"<table:table-cell office:value-type='float' office:value='{value!r}'/>"
+
+
+def write_xls(path: Path, rows: Rows, hidden: Sequence[int] = ()) -> None:
+    """Write a workbook of Excel 97 with the sheet a: texts, numbers, and the errors #DIV/0! and #REF!; rows from 0."""
+    stream = _biff(0x809, "<4H", 0x600, 5, 0, 0) + _biff(0xE0, "<20s", b"")
+    start = len(stream) + 13 + 4  # after the next two records
+    stream += _biff(0x85, "<IBBBB1s", start, 0, 0, 1, 0, b"a") + _biff(0xA, "")
+    stream += _biff(0x809, "<4H", 0x600, 16, 0, 0)
+    for row in hidden:
+        stream += _biff(0x208, "<8H", row, 0, len(rows[row]), 255, 0, 0, 0x20, 0)
+    for row, cells in enumerate(rows):
+        for column, value in enumerate(cells):
+            where = (row, column, 0)
+            if isinstance(value, str) and value.startswith("#"):
+                stream += _biff(0x205, "<3HBB", *where, {"#DIV/0!": 7, "#REF!": 23}[value], 1)
+            elif isinstance(value, str):
+                text = value.encode("latin-1")
+                stream += _biff(0x204, f"<4HB{len(text)}s", *where, len(text), 0, text)
+            elif value is not None:
+                stream += _biff(0x203, "<3Hd", *where, value)
+    path.write_bytes(_ole_file("Workbook", stream + _biff(0xA, "")))
+
+
+def _biff(kind: int, layout: str, *values: object) -> bytes:
+    content = struct.pack(layout, *values)
+    return struct.pack("<2H", kind, len(content)) + content
 
 
 def encrypted_workbook() -> bytes:
     """The OLE file of a workbook with a password: a folder with the stream EncryptedPackage, which has no meaning."""
+    return _ole_file("EncryptedPackage", b"x")
+
+
+def _ole_file(name: str, stream: bytes) -> bytes:
+    """An OLE file with one stream of at most 4,096 bytes."""
     free, end, table = 0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD
     head = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1".ljust(24, b"\0") + struct.pack("<5H6x", 62, 3, 0xFFFE, 9, 6)
     head += struct.pack("<9I", 0, 1, 1, 0, 4096, end, 0, end, 0) + struct.pack("<109I", 0, *[free] * 108)
     sectors = struct.pack("<128I", table, end, *range(3, 10), end, *[free] * 118)
-    folder = _ole_entry("Root Entry", 5, 1, end, 0) + _ole_entry("EncryptedPackage", 2, free, 2, 4096)
-    return head + sectors + folder.ljust(512, b"\0") + b"x" * 4096
+    folder = _ole_entry("Root Entry", 5, 1, end, 0) + _ole_entry(name, 2, free, 2, 4096)
+    return head + sectors + folder.ljust(512, b"\0") + stream.ljust(4096, b"\0")
 
 
 def _ole_entry(name: str, kind: int, child: int, start: int, size: int) -> bytes:

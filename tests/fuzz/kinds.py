@@ -70,7 +70,7 @@ def _input(name: str, file: str, make: Callable[[Path], None], reads: Meaning, n
 
 def _simulated(name: str, file: str, make: Callable[[Path], None], names_others: bool = False) -> Kind:
     """What SUMO reads a copy of."""
-    reads = meaning.gzipped(meaning.xml)
+    reads = meaning.rows if file.endswith(".csv") else meaning.gzipped(meaning.xml)
     return Kind(name, f"scenario/{file}", make, reads, names_others=names_others, simulated=True, checked=True)
 
 

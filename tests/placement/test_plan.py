@@ -17,7 +17,9 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_tpog
 from egvs.drawing import svg_figures
+from egvs.placement import problem_builder
 from egvs.scoring.egvs import EntropyField
+from egvs.sensors.sites import candidate_sites
 
 SITES = """site,x_m,y_m,z_m,cost
 a,10,12,3,
@@ -169,6 +171,16 @@ def test_budget_pays_each_pole_once_and_forced_sensors_never(five_candidates: Pa
     assert plan["cost"] == 70.0
 
 
+def test_poles_that_exist_are_free_and_have_known_names(five_candidates: Path) -> None:
+    costs = ["costs.sensor.small=20", "costs.pole=50", "costs.metre=1", "sites.existing_poles=['a', 'b']"]
+    scenario = egvs.load(five_candidates, costs)
+    cost, pole_cost = problem_builder.candidate_costs(scenario, candidate_sites(scenario))
+    assert cost.tolist() == [23.0, 23.0, 25.0, 70.0, 74.0]
+    assert pole_cost.tolist() == [0.0, 0.0, 0.0, 0.0, 50.0]
+    with pytest.raises(egvs.InputError, match=r"sites\.existing_poles: there is no site 'b_high'"):
+        candidate_sites(egvs.load(five_candidates, ["sites.existing_poles=['b_high']"]))
+
+
 @pytest.mark.slow
 def test_smallest_plan_that_reaches_share(five_candidates: Path, out: Path, run_egvs) -> None:
     code, text, error = run_egvs("place", five_candidates, "--out", out, "--reach", 0.9)
@@ -262,7 +274,10 @@ REJECTED = {
         ["--count", "1", "--reach", "0.01", "--set", ZONE % (0.5, 2)],
         "placement.zones: found no plan of 1 sensor that meets the requirements of all zones",
     ),
-    "no costs": (["--budget", "50"], "placement.budget: the cost of site a is unknown"),
+    "no costs": (
+        ["--budget", "50"],
+        'the cost of site a is unknown. Add a [costs] table, or a column "cost" to sites.csv.',
+    ),
     "a sensor without a price": (
         ["--budget", "50", "--set", "costs.sensor.VLP-16=1"],
         "costs.sensor: the cost of sensor small (site a) is unknown",
@@ -473,21 +488,15 @@ def test_very_large_gamma_counts_every_beam(three_candidates: Path, tmp_path: Pa
     assert [sensor.site for sensor in plans[0].sensors] == [sensor.site for sensor in plans[1].sensors]
 
 
-def test_curve_shows_costs(three_candidates: Path, tmp_path: Path, run_egvs) -> None:
+def test_plan_shows_costs(three_candidates: Path, tmp_path: Path, run_egvs) -> None:
     arguments = ("place", three_candidates, "--out", tmp_path / "out", "--count", 2)
     _, text, _ = run_egvs(*arguments, "--set", "costs.pole=7")
-    header, first, second = _curve_lines(text)
-    assert header[-2:] == ["cost", "sites"]
-    curve, _ = parquet.read_artefact(tmp_path / "out" / "curve.parquet", "curve")
-    for row, line in zip(curve.to_pylist(), (first, second), strict=True):
-        names = ", ".join(json.loads(row["sites"])).split()
-        assert line[-len(names) - 1 :] == [f"{row['cost']:g}", *names]
-
-
-def _curve_lines(text: str) -> list[list[str]]:
     lines = [line.split() for line in text.splitlines()]
-    start = next(i for i, line in enumerate(lines) if line[:1] == ["sensors"])
-    return lines[start : start + 3]
+    header = next(number for number, line in enumerate(lines) if line[:1] == ["site"])
+    assert lines[header][-1] == "cost"
+    placement, _ = parquet.read_artefact(tmp_path / "out" / "placement.parquet", "placement")
+    costs = [(row["site"], f"{row['cost']:g}") for row in placement.to_pylist()]
+    assert [(line[1], line[-1]) for line in lines[header + 1 : header + 3]] == costs
 
 
 @pytest.mark.slow
@@ -535,3 +544,20 @@ def test_says_that_time_limit_was_reached(three_candidates: Path, tmp_path: Path
             "place", three_candidates, "--out", tmp_path / "out", "--count", 2, "--exact", "--time-limit", "9s"
         )
         assert ("--exact reached its --time-limit of 9s" in text) is has_note
+
+
+def test_rule_that_forbids_one_more_is_named(five_candidates: Path, out: Path, run_egvs) -> None:
+    """Three candidates at two poles, one sensor for each pole: the explorer recommends no third one either."""
+    rules = ("--set", "placement.most_per_pole=1", "--set", "placement.excluded=['c', 'd']")
+    assert run_egvs("run", five_candidates, "--out", out, *rules)[0] == 0
+    code, text, error = run_egvs("place", five_candidates, "--out", out, "--count", 3, *rules)
+    assert code == 0, error
+    assert "most_per_pole = 1 forbids a third sensor beside them." in text and "adds nothing" not in text
+    assert "most_per_pole = 1 forbids a third sensor beside them." in (out / "report.html").read_text()
+    plan = egvs.open_session(out).plan
+    assert plan is not None and len(plan.sites) == 2
+    assert (plan.best_next, plan.forbids_more) == (None, "most_per_pole = 1")
+
+    apart = ("--set", "placement.least_distance_m=1000")
+    _, text, _ = run_egvs("place", five_candidates, "--out", out / "apart", "--count", 3, *apart)
+    assert "least_distance_m = 1000 forbids a second sensor beside it." in text

@@ -67,7 +67,7 @@ def test_page_shows_the_section_and_its_warning(site: Path, tmp_path: Path) -> N
     (out / "notes.txt").write_text("stop")
     text = render_report(scenario, out)
     assert ", but a note says stop</h1>" in text
-    assert '<p class="lede">It rains: see the <a href="#notes">note</a>.</p>' in text
+    assert '<p>It rains: see the <a href="#notes">note</a>.</p>' in text
 
 
 def test_files_template_and_module_are_inputs_of_the_report(site: Path, tmp_path: Path) -> None:

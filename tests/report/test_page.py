@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -85,6 +86,23 @@ def test_has_no_table_of_counts_without_counts(plain_run):
     assert "Counted and simulated" not in plain_run[2]
 
 
+def test_the_answer_and_its_map_come_first(plain_run):
+    """Two lines, the map, what is assumed; what compares scores comes after the ranking."""
+    text = PageReader(plain_run[2]).text.partition("Before you trust")[0]
+    assert "is the best of 4 sites" in text
+    page = plain_run[2]
+    positions = [page.index(part) for part in ("<h1>", '<p class="lede">', "<svg", 'class="caveats"', "<table")]
+    assert positions == sorted(positions)
+    assert page.index("<h2>Ranking") < page.index("<h2>What the score means")
+
+
+def test_no_heading_skips_a_level(plain_run):
+    levels = [int(tag[1]) for tag, _ in PageReader(plain_run[2]).tags if re.fullmatch("h[1-6]", tag)]
+    assert levels[0] == 1
+    assert levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in pairwise(levels))
+
+
 def test_page_is_well_formed_and_ids_are_unique(plain_run):
     read = PageReader(plain_run[2])
     assert len(read.ids) == len(set(read.ids)) > 5
@@ -111,7 +129,7 @@ def test_escapes_text_of_users(plain_run):
 
 def test_every_figure_has_a_text_alternative(plain_run):
     drawn = [values for tag, values in PageReader(plain_run[2]).tags if tag == "svg"]
-    assert len(drawn) == 11
+    assert len(drawn) == 12
     assert all(values["role"] == "img" and values["aria-label"] for values in drawn)
     rows = read_scores(plain_run[1] / "scores.parquet").to_pylist()
     best = next(row for row in rows if row["rank"] == 1)
@@ -183,8 +201,19 @@ def test_ranking_has_every_site_and_equal_scores_share_a_rank(tmp_path):
 def test_headline_names_the_best_site_and_the_lead(plain_run):
     rows = sorted(read_scores(plain_run[1] / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
     text = PageReader(plain_run[2]).text
-    assert f"{rows[0]['site']} is the best of 4 sites" in text
+    assert f"Pole {rows[0]['site']}, 1.5 m up, level, is the best of 4 sites" in text
     assert f"leads the next site, {rows[1]['site']}, by {100 * (1 - rows[1]['egvs'] / rows[0]['egvs']):.1f} %" in text
+
+
+def test_says_which_losses_of_returns_are_simulated(plain_run, tmp_path):
+    scenario, out, text = plain_run
+    shutil.copytree(out, tmp_path / "out")
+    record = make_record()
+    summary = {"sites": 4, "solids": 3, "lanes": 0, "losses": ["losses are simulated for small (17 m)"]}
+    record["stages"]["check"] = record["stages"]["tpog"] | {"summary": summary}
+    (tmp_path / "out" / "run.json").write_text(json.dumps(add_checksum(record)))
+    assert "Losses are simulated for small (17 m)." in render_report(scenario, tmp_path / "out")
+    assert "losses are simulated" not in text.lower()
 
 
 def test_shows_the_record_of_the_run(plain_run):
@@ -251,17 +280,6 @@ def test_compares_sensors_where_there_are_several(tmp_path):
     assert "docs/validity.md" in section
 
 
-def test_shows_what_one_more_percentage_point_costs(tmp_path):
-    costs = {"sensor": {"small": 1000, "dense": 4000}}
-    section = sensor_section(tmp_path, costs=costs)
-    scores = read_scores(tmp_path / "out" / "scores.parquet").to_pydict()
-    seen = dict(zip(scores["site"], scores["seen_well"], strict=True))
-    points = 100 * (seen["n dense"] - max(seen["n small"], seen["s"]))
-    assert points > 0
-    assert f'data-label="One more point costs">{3000 / points:,.0f}<' in section
-    assert "PRICE" not in section
-
-
 def test_has_no_section_on_sensors_with_one_sensor(plain_run):
     assert "Which sensor?" not in plain_run[2]
 
@@ -275,8 +293,8 @@ def test_costs_are_an_input_of_the_page(plain_run, tmp_path):
 def test_page_of_one_site(tmp_path):
     text = render_report(*run_to_scores(tmp_path, sites=SITES[:1]))
     read = PageReader(text)
-    assert "north, the only site, sees" in read.text
-    assert sum(tag == "svg" for tag, _ in read.tags) == 7
+    assert "Pole north, 2 m up, level, the only site, sees" in read.text
+    assert sum(tag == "svg" for tag, _ in read.tags) == 8
 
 
 def test_page_without_traffic(tmp_path):

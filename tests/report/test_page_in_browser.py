@@ -93,11 +93,24 @@ def page(report: Path, browser: Any, request: pytest.FixtureRequest) -> Iterator
 @needs("validation")
 def test_report_has_every_section_with_the_map_before_the_tables(page: Any) -> None:
     assert page.locator("h2").all_inner_texts() == ["Before you trust this ranking", *SECTIONS]
+    assert page.locator("details:not([open]) > summary > h2").count() >= 4  # what only experts read is folded
     tops = page.evaluate("['svg', 'table'].map(e => document.querySelector(e).getBoundingClientRect().top)")
     assert tops[0] < tops[1]
 
 
+@pytest.mark.parametrize(("width", "height"), [(1280, 900), (390, 844)])
+def test_the_first_screen_is_the_answer_and_a_map(report: Path, browser: Any, width: int, height: int) -> None:
+    page = browser.new_page(viewport={"width": width, "height": height})
+    page.goto(report.as_uri())
+    answer = page.locator("#answer svg").bounding_box()
+    assert answer["y"] + answer["height"] <= height
+    assert answer["width"] > 0.8 * min(width, 640)
+    assert page.locator("h1").bounding_box()["y"] < answer["y"] + answer["height"]
+    page.close()
+
+
 def test_page_does_not_scroll_sideways(page: Any) -> None:
+    page.evaluate("document.querySelectorAll('details').forEach(each => each.open = true)")
     assert page.evaluate("document.documentElement.scrollWidth - innerWidth") == 0
     assert page.evaluate(OUTSIDE) == []
 
@@ -105,6 +118,7 @@ def test_page_does_not_scroll_sideways(page: Any) -> None:
 def test_wide_tables_scroll_by_themselves_on_a_phone(report: Path, browser: Any) -> None:
     page = browser.new_page(viewport={"width": 390, "height": 900})
     page.goto(report.as_uri())
+    page.evaluate("document.querySelectorAll('details').forEach(each => each.open = true)")
     page.add_style_tag(content="table { min-width: 60rem; }")  # whatever the names, now they are all too wide
     regions = page.locator(".scroll:has(table)")
     assert regions.count() >= 6

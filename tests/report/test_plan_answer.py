@@ -81,7 +81,7 @@ def test_first_site_of_a_plan_is_compared_with_the_best_single_one() -> None:
 
 
 def test_only_several_sensors_ranked_by_vehicles_found_assume_independence() -> None:
-    assert "independently of each other" in describe_joint_score(FOUND, 2)
+    assert "miss vehicles independently" in describe_joint_score(FOUND, 2)
     assert describe_joint_score(FOUND, 1) == ""
     assert describe_joint_score(EGVS, 2) == ""
 
@@ -140,6 +140,20 @@ def test_sensor_that_meets_requirements_is_useful() -> None:
     assert describe_count([replace(first, met=False), second], FOUND) == (
         "A second sensor is needed to meet the requirements; it adds 0.2 percentage points."
     )
+
+
+def test_names_the_rule_that_forbids_one_more() -> None:
+    three = with_sites(steps_of(0.80, 0.90, 0.90), "a", "ab", "ab")
+    rule = "most_per_pole = 1 forbids a third sensor beside them."
+    assert describe_count(three, FOUND, forbids_more="most_per_pole = 1") == (
+        "A second sensor adds 10.0 percentage points to the share of vehicles found: 90.0 %, against 80.0 % with one. "
+        + rule
+    )
+    assert describe_count(three[:1], FOUND, forbids_more="a and b") == "a and b forbid a second sensor beside it."
+    worst = describe_count(three, FOUND, objective="the worst period", forbids_more="most_per_pole = 1")
+    assert worst.endswith(f"the plan maximises the worst period. {rule}")
+    plan = replace(plan_of(three[:2], sensors=2, candidates=4), forbids_more="most_per_pole = 1")
+    assert next_count(plan) is None
 
 
 def test_other_objective_has_no_verdict() -> None:

@@ -6,6 +6,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,7 +21,7 @@ from egvs.results.levels import (
     GroupLevel,
     NoticedShare,
 )
-from egvs.results.ranking import Pole, RankedSite, Ranking, ScoreValue
+from egvs.results.ranking import Pole, RankedSite, Ranking, ScoreValue, site_titles
 from egvs.results.sensors import SensorComparison
 from egvs.results.study_results import STUDY
 from egvs.scenario.loading import load
@@ -89,28 +90,45 @@ def test_the_headline_names_whose_level_it_is_with_the_measured_error() -> None:
     found = f"should find 84 ± {math.ceil(100.0 * error)} % of vehicles"
     ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
     assert ranking_text.headline(ranked, has_traffic=True, found=BOTH) == (
-        f"a is the best of 2 sites: detectors (cluster, pointpillars) {found}; people would notice 90 ± 10 % in its "
-        "sweeps (curves of one junction)"
+        f"a is the best of 2 sites: detectors {found}; people would notice 90 ± 10 %"
     )
     of_one = f"should find 84 ± {math.ceil(100.0 * DetectionLevel(('cluster',)).error(0.01))} % of vehicles"
     assert ranking_text.headline(
         with_noticed(("a", 0.841, 0.897)), has_traffic=True, found=DetectionLevel(("cluster",))
-    ) == (
-        f"a, the only site: the detector cluster {of_one}; people would notice 90 ± 10 % in its sweeps (curves of one "
-        "junction)"
-    )
+    ) == (f"a, the only site: the detector cluster {of_one}; people would notice 90 ± 10 %")
     tie = with_noticed(("a", 0.841, 0.897), ("b", 0.841, 0.897))
     assert ranking_text.headline(replace(tie, best=tie.sites), has_traffic=True, found=BOTH).startswith(
-        f"All 2 sites score the same: detectors (cluster, pointpillars) {found}; "
+        f"All 2 sites score the same: detectors {found}; "
     )
     both_first = with_noticed(("a", 0.841, 0.897), ("b", 0.841, 0.897), ("c", 0.5, 0.6))
     assert ranking_text.headline(replace(both_first, best=both_first.sites[:2]), True, BOTH).startswith(
-        f"a and b share first place among 3 sites; from a, detectors (cluster, pointpillars) {found}"
+        f"a and b share first place among 3 sites; from a, detectors {found}"
     )
     without = by_vehicles(("a", 50.0, 0.841), ("b", 90.0, 0.8))  # a run of an earlier version
     assert ranking_text.headline(without, has_traffic=True, found=BOTH) == (
-        f"a is the best of 2 sites: detectors (cluster, pointpillars) {found}"
+        f"a is the best of 2 sites: detectors {found}"
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "title"),
+    [
+        ("k04@3m+0deg", {"pole": "k04"}, "pole k04, 3 m up, level"),
+        ("k04@4.5m-10deg", {"pole": "k04", "z_m": 104.5, "pitch_deg": -10.0}, "pole k04, 4.5 m up, tilted 10° down"),
+        ("Pole 7", {"z_m": 6.0, "pitch_deg": 2.5}, "Pole 7, 6 m up, tilted 2.5° up"),
+        ("kerb", {"z_m": 6.0, "roll_deg": 180.0}, "pole kerb, 6 m up, level, upside down"),
+    ],
+)
+def test_a_site_is_named_as_people_would(name: str, values: dict[str, Any], title: str) -> None:
+    site = replace(ranking((name, 1.0, 1, 0.5, 0.9)).sites[0], **{"pole": name, "z_m": 3.0, **values})
+    assert site_titles([site]) == {name: title}
+    same = replace(site, site=f"{name}_b", yaw_deg=90.0)
+    assert site_titles([site, same])[same.site] == f"{title} ({same.site})"
+
+
+def test_a_height_above_sloping_ground_is_not_made_up() -> None:
+    site = replace(ranking(("kerb", 1.0, 1, 0.5, 0.9)).sites[0], z_m=212.42)
+    assert site_titles([site], has_relief=True) == {"kerb": "pole kerb, at z 212.4 m, level"}
 
 
 def test_a_level_with_a_large_error_is_a_range() -> None:
@@ -124,11 +142,11 @@ def test_no_number_is_printed_for_a_level_that_was_not_measured() -> None:
     ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
     assert ranking_text.headline(ranked, has_traffic=True, found=DetectionLevel(("pointpillars_sensor",))) == (
         "a is the best of 2 sites: level not measured for the detector pointpillars_sensor; people would notice 90 ± "
-        "10 % in its sweeps (curves of one junction)"
+        "10 %"
     )
     without = replace(BOTH, has_losses=False)
     assert ranking_text.headline(by_vehicles(("a", 1.0, 0.9), ("b", 1.0, 0.8)), True, without) == (
-        "a is the best of 2 sites: level not measured for detectors (cluster, pointpillars) without losses of returns"
+        "a is the best of 2 sites: level not measured for detectors without losses of returns"
     )
     assert DetectionLevel(("cluster_uncorrected",), has_losses=False).is_measured
     off = load(SCENARIOS / "demo", ["effects.range_limit=false"])
@@ -153,9 +171,7 @@ def test_the_level_error_is_that_of_the_groups() -> None:
 def test_a_level_that_nothing_supports_is_a_range() -> None:
     ranked = with_noticed(("a", 0.841, 0.7), ("b", 0.8, 0.89), low=0.02, high=0.09)
     assert not ranked.sites[0].noticed.is_measured
-    assert ranking_text.headline(ranked, has_traffic=True, found=BOTH).endswith(
-        "people would notice 65 to 80 % in its sweeps (curves of one junction)"
-    )
+    assert ranking_text.headline(ranked, has_traffic=True, found=BOTH).endswith("people would notice 65 to 80 %")
     assert with_noticed(("a", 0.841, 0.7), low=0.02, high=0.07).sites[0].noticed.text == "70 ± 10 %"
     assert [NoticedShare(0.5, None, low, high).cell for low, high in ((0.45, 0.65), (0.0, 1.0), (0.81, 0.99))] == [
         "45 to 65 %", "0 to 100 %", "80 to 100 %",
@@ -179,8 +195,7 @@ def test_what_detectors_find_is_a_range_where_many_vehicles_are_of_no_measured_g
     ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))
     assert ranking_text.headline(ranked, has_traffic=True, found=of_cars) == (
         "a is the best of 2 sites: the detector cluster_uncorrected should find 65 to 95 % of vehicles (nothing is "
-        "known of the 25 % that are not cars); people would notice 90 ± 10 % in its sweeps (curves of one "
-        "junction)"
+        "known of the 25 % that are not cars); people would notice 90 ± 10 %"
     )
     assert replace(BOTH, groups=(replace(people, weight_share=1.0),)).text(0.5, None) == "0 to 100 %"
     few = (replace(cars, weight_share=0.9), replace(people, weight_share=0.1))

@@ -1,4 +1,4 @@
-"""The best mount of each sensor, and the cost of one more percentage point, computed by hand."""
+"""The best mount of each sensor, and its cost, computed by hand."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ from dataclasses import replace
 
 import pytest
 
-from egvs.report.sensor_text import SENSOR_EVIDENCE, costs_option, describe_evidence, explain_differences, range_note
+from egvs.report.sensor_text import (
+    SENSOR_EVIDENCE,
+    costs_option,
+    describe_evidence,
+    explain_sensor_differences,
+    range_note,
+)
 from egvs.results.ranking import RankedSite, ScoreValue
 from egvs.results.sensors import (
     ScoreDifference,
@@ -34,46 +40,32 @@ def compare(*sites: RankedSite, prices: Mapping[str, float] = PRICES) -> SensorC
     return comparison
 
 
-def test_one_more_point_costs_the_price_difference_over_the_gain() -> None:
-    """4000 more for 20 points: 200 each; 14000 more for 25 points: 560 each, and 2000 beyond the medium one."""
+def test_sensors_are_compared_with_the_cheapest() -> None:
     comparison = compare(site("a", "large", 0.85), site("b", "medium", 0.80), site("c", "small", 0.60))
     assert [result.mount.sensor for result in comparison.results] == ["small", "medium", "large"]
     assert [result.cost_text for result in comparison.results] == ["4,000", "8,000", "18,000"]
-    assert [result.cost_per_point_text for result in comparison.results] == ["-", "200", "560"]
-    assert [result.step_cost_text for result in comparison.results] == ["-", "200", "2,000"]
     assert [result.gain_text for result in comparison.results] == ["-", "+20.0 ± 0.4", "+25.0 ± 0.4"]
 
 
 def test_costs_contain_pole_and_height() -> None:
-    """One point more on a pole 2 m higher: 4000 + 2 * 100."""
+    """2 m higher: 200 more."""
     sites = (site("a", "medium", 0.61, z_m=5.0, se=0.0001), site("b", "small", 0.60, se=0.0001))
     comparison = SensorComparison.of_run(sites, CostsConfig(sensor=dict(PRICES), pole=12000.0, metre=100.0))
     assert comparison is not None
     assert [result.mount.cost for result in comparison.results] == [16300.0, 20500.0]
-    gain = comparison.results[1].gain
-    assert gain is not None
-    assert gain.cost_per_point == pytest.approx(4200.0)
 
 
-def test_dearer_sensor_that_finds_less_has_no_cost_per_point() -> None:
-    comparison = compare(site("a", "medium", 0.80), site("b", "large", 0.70), site("c", "small", 0.60))
-    assert comparison.results[2].cost_per_point_text == "1,400"
-    assert comparison.results[2].step_cost_text == "no gain"
-
-
-def test_gain_within_its_error_has_no_cost_per_point() -> None:
+def test_gain_within_its_error_is_marked() -> None:
     comparison = compare(site("a", "medium", 0.602), site("b", "small", 0.60))
     assert comparison.results[1].gain_text == "~ +0.2 ± 0.4"
-    assert comparison.results[1].cost_per_point_text == "not clear"
 
 
 def test_without_a_cost_the_sensor_that_finds_least_is_the_baseline() -> None:
     comparison = compare(site("a", "large", 0.85), site("b", "small", 0.60), prices={"small": 4000.0})
     assert not comparison.has_costs
     assert comparison.baseline.sensor == "small"
-    assert "which finds least" in explain_differences(comparison)
+    assert "which finds least" in explain_sensor_differences(comparison)
     assert [result.cost_text for result in comparison.results] == ["4,000", "-"]
-    assert not comparison.shows_cost_per_point
     assert costs_option(comparison.sensors) == """--set 'costs.sensor={"small" = PRICE, "large" = PRICE}'"""
 
 
@@ -81,11 +73,8 @@ def test_sensors_with_a_cost_are_compared_without_that_of_another() -> None:
     sites = site("a", "large", 0.85), site("b", "medium", 0.80), site("c", "small", 0.60)
     comparison = compare(*sites, prices={"small": 4000.0, "large": 18000.0})
     assert [result.mount.sensor for result in comparison.results] == ["small", "large", "medium"]
-    assert comparison.shows_cost_per_point
-    assert [result.cost_per_point_text for result in comparison.results] == ["-", "560", "-"]
-    assert [result.step_cost_text for result in comparison.results] == ["-", "560", "-"]
-    assert "the cheapest with a known cost" in explain_differences(comparison)
-    assert explain_differences(comparison).endswith("Without a known cost: medium.")
+    assert "the cheapest with a known cost" in explain_sensor_differences(comparison)
+    assert explain_sensor_differences(comparison).endswith("Without a known cost: medium.")
 
 
 def test_one_sensor_is_not_compared() -> None:
@@ -103,6 +92,11 @@ def test_best_mount_of_a_sensor_is_its_first_site_by_rank() -> None:
 def test_column_cost_replaces_the_price(text: str, cost: float | None) -> None:
     own = replace(site("a", "small", 0.6), user_columns=(("owner", "city"), ("cost", text)))
     assert site_cost(own, CostsConfig(sensor=PRICES)) == cost
+
+
+@pytest.mark.parametrize(("existing", "cost"), [((), 4500.0), (("b",), 4500.0), (("a",), 4000.0), ("all", 4000.0)])
+def test_pole_that_exists_costs_nothing(existing: tuple[str, ...], cost: float) -> None:
+    assert site_cost(site("a", "small", 0.6), CostsConfig(sensor=PRICES, pole=500.0), existing) == cost
 
 
 def test_independent_errors_are_added_in_quadrature() -> None:
@@ -130,8 +124,6 @@ def test_evidence_is_that_of_the_score_that_ranks() -> None:
     sites = [replace(result.mount.site, rank_by="egvs", others=()) for result in by_share.results]
     by_egvs = compare(*sites)
     assert "whether EGVS ranks different sensors as detectors do was not measured" in describe_evidence(by_egvs)
-    assert not by_egvs.shows_cost_per_point
-    assert [result.cost_per_point_text for result in by_egvs.results] == ["-", "-"]
 
 
 def test_difference_in_bits_has_no_percentage_points() -> None:

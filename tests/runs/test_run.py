@@ -95,7 +95,7 @@ def test_second_run_skips_every_stage(done: tuple[Path, Path], run_egvs) -> None
     code, printed, said = run_egvs("run", mini, "--out", out)
     assert code == 0
     assert said.count("unchanged") == len(STAGE_NAMES)
-    assert said.endswith("no stage ran: no input has changed since the last run\n")
+    assert "\nno stage ran: no input has changed since the last run\n" in said
     assert "pole_a" in printed
     assert before == {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and not p.name.startswith(".")}
 
@@ -418,6 +418,5 @@ def test_prints_best_sites_and_counts_others(mini: Path, tmp_path: Path, run_egv
     assert listed("score", mini, "--top", 4) == ranked[:4]
     assert listed("run", mini, "--all") == ranked + ranked, "the complete ranking, and the poles"
     assert "... and 5 more; omit --top" in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 4)[1]
-    assert "4 more poles: --all lists all" in run_egvs("run", mini, "--out", tmp_path / "out")[1]
     assert "omit --top" not in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
     assert run_egvs("run", mini, "--top", 0)[0] == 2

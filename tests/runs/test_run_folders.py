@@ -412,7 +412,7 @@ def test_warns_of_files_that_have_changed_since_the_run(here: Path, run_egvs: An
     code, printed, messages = run_egvs("place", OTHER, "--count", 1)
     assert code == 0
     assert f"warning: sites.csv has changed since the run in {OTHER}: its stages run again as needed" in messages
-    assert "all 3 candidates" in printed
+    assert "The plan pole_c " in printed
 
 
 def test_says_which_settings_the_scenario_file_has_changed_since_the_run(here: Path, run_egvs: Any) -> None:

@@ -169,6 +169,8 @@ def test_rejects_ranking_without_weighted_vehicles(mini: Path, tmp_path: Path, r
         ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1]]}", "score.weights.zones.z.polygon_m"),
         ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1],[1,0],[0,1]]}", "expected a polygon"),
         ("score.weights.zones.z={weight=1, polygon_m=[[0,0],[1,1],[2,2]]}", "encloses an area (Self"),
+        (f"score.weights.zones.z={{weight=1, polygon_m={[[i, i * i] for i in range(3001)]}}}",
+         "got 3,001 corners. The limit is 3,000 corners; set EGVS_MAX_CORNERS to raise it"),
         ("score.weights.zones.z={polygon_m=[[0,0],[1,1],[2,0]]}", "score.weights.zones.z.weight: this key is required"),
         ("score.weights.zone={}", "Did you mean zones?"),
     ],

@@ -30,6 +30,7 @@ from egvs.stages import scene_checks
 from egvs.stages.inputs import CheckInputs
 from egvs.stages.site_scans import empty_scans
 from tests.clouds.cloud_scenes import frame_of
+from tests.conftest import SCENARIO
 
 ELEVATIONS_DEG, CLOCKWISE_DEG = [15.0, 1.5, -0.25, -25.0], [3.1, 1.0, -1.1, -3.2]
 
@@ -329,6 +330,16 @@ def test_prints_what_is_read(tmp_path: Path, run_egvs: Any) -> None:
     assert "2 single beams, one per row; azimuths 2 to 4 deg" in words
     assert "warning: 2 beams in a turn or frame" in words
     assert "VLP-16" in words
+    (tmp_path / "scenario.toml").write_text(
+        SCENARIO + '[sensors.mine]\nbeams = "rings.csv"\nrange_m = 80\n', encoding="utf-8"
+    )
+    code, printed, _ = run_egvs("sensors", "mine", "VLP-16", "--scenario", tmp_path)
+    words = " ".join(printed.split())
+    assert code == 0 and "mine beams: 2 of one turn or frame; scan pattern without rings" in words
+    assert "view: azimuth 2 to 4 deg, elevation -3 to 1 deg range: 80 m" in words
+    assert "warning: mine has 2 beams in a turn or frame" in words and "VLP-16 beams: 28800" in words
+    code, _, error = run_egvs("sensors", "mime", "--scenario", tmp_path)
+    assert code == 2 and "unknown sensor 'mime'. Did you mean mine?" in error
     code, _, error = run_egvs("sensors", str(tmp_path / "absent.json"))
     assert code == 2
     assert "absent.json: there is no such file. Check the path." in " ".join(error.split())

@@ -208,6 +208,8 @@ PLACE = "site,x_m,y_m\np,0,0\n"
             r"sites\.yaw_deg: .*no effect on any site: each row of sites\.csv has its own yaw_deg or aim",
         ),
         ("site,x_m,y_m,z_m,roll_deg\np,0,0,6,0\n", {"roll_deg": "0"}, r"sites\.roll_deg: .*no effect on any site"),
+        ("site,x_m,y_m,z_m,mount\np,0,0,6,upright\n", {"mount": '"inverted"'}, r"sites\.mount: .*no effect on any"),
+        ("site,x_m,y_m,z_m,mount\np,0,0,6,hanging\n", {}, r"\(p\): mount: expected upright or inverted, got 'hanging'"),
         (
             "site,x_m,y_m,z_m,sensor\np,0,0,6,VLP-16\n",
             {"sensor": "OS1-128"},
@@ -311,6 +313,28 @@ def test_recorded_scenario_may_have_sensor_and_roll_that_rows_override(mini: Pat
     scenario = egvs.load(mini)
     recorded = json.loads(json.dumps(scenario.model_dump(mode="json")))
     assert sites.candidate_sites(scenario_from_dict(recorded, mini, "run.json")) == sites.candidate_sites(scenario)
+
+
+def test_sensor_that_is_upside_down(mini: Path) -> None:
+    """By the row, else by [sites], else by the sensor; the front and the aim stay, and the sides change places."""
+    (mini / "sites.csv").write_text(
+        "site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,mount\na,0,0,6,30,-9,2,inverted\nb,0,0,6,30,-9,,upright\nc,0,0,6,,-9,,\n"
+    )
+
+    def rolls(*settings: str) -> list[float]:
+        return [site.pose.roll_deg for site in sites.candidate_sites(egvs.load(mini, list(settings)))]
+
+    assert rolls() == [-178, 0, 0]
+    assert rolls("sites.mount='inverted'") == [-178, 0, 180]
+    assert rolls("sensors.small.mount='inverted'") == [-178, 0, 180]
+    assert rolls("sensors.small.mount='inverted'", "sites.mount='upright'") == [-178, 0, 0]
+    hung, stood, _ = sites.candidate_sites(egvs.load(mini))
+    assert (hung.pose.is_inverted, stood.pose.is_inverted) == (True, False)
+    front = [rotation_world_sensor(*site.pose.angles_deg)[:, 0] for site in (hung, stood)]
+    assert front[0] == pytest.approx(front[1])
+    assert rotation_world_sensor(*hung.pose.angles_deg)[2, 2] < -0.9
+    aimed = {name: sites_from(mini, mount=f'"{name}"', aim='"roi"')[2].pose for name in ("upright", "inverted")}
+    assert aimed["inverted"].yaw_deg == aimed["upright"].yaw_deg and aimed["inverted"].roll_deg == 180
 
 
 @pytest.mark.parametrize(("other", "result"), [("aim_m = [1, 2]", "aim and aim_m"), ("yaw_deg = 0", "aim and yaw_deg")])

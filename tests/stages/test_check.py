@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,9 +14,9 @@ import egvs
 from egvs.core.errors import DiagnosticsError, InputError
 from egvs.report.sections import describe_poles_on_road
 from egvs.sensors.sites import Pose, Site
-from egvs.stages import check, scene_checks, traffic_checks
+from egvs.stages import check, scene_checks
 from egvs.stages.inputs import CheckInputs, Inputs
-from egvs.traffic import network, sumo, sumo_folder
+from egvs.traffic import network
 from egvs.world.carriageway import Carriageway
 from tests.conftest import collection, feature
 from tests.stage_runner import inputs_of
@@ -50,6 +51,24 @@ def statics(folder: Path, *features: dict) -> None:
 def test_valid_scenario_has_no_finding(street: Path, mini: Path) -> None:
     checked = check.check_scenario(egvs.load(street))
     assert (checked.findings, checked.sites, checked.solids, checked.lanes) == ((), 2, 3, 2)
+
+
+def test_says_where_each_pole_stands(street: Path) -> None:
+    """Lanes are 3.2 m wide and meet at y = 0; the building is at x 14 to 18 m, y 5 to 8 m."""
+    sites(street, "beside,10,12,3", "high,10,12,5", "inside,30,1.2,8", "far,16,40,3")
+    poles = {pole.pole: pole for pole in check.check_scenario(egvs.load(street)).poles}
+    assert list(poles) == ["beside", "inside", "far"]
+    assert poles["beside"].kerb_m == pytest.approx(12 - 3.2)
+    assert poles["beside"].wall_m == pytest.approx(math.hypot(4, 4))
+    assert poles["inside"].kerb_m == pytest.approx(2.0)
+    assert poles["far"].wall_m == pytest.approx(32.0)
+    lone, *_ = check.check_scenario(egvs.load(street, ["statics.footprints=[]"])).poles
+    assert math.isnan(lone.wall_m)
+
+
+def test_pole_without_network_and_walls_has_no_distances(mini: Path) -> None:
+    lone, *_ = check.check_scenario(egvs.load(mini, ["statics.footprints=[]"])).poles
+    assert (lone.where, math.isnan(lone.kerb_m), math.isnan(lone.wall_m)) == ("", True, True)
 
 
 def test_no_lane_rule_applies_without_network(mini: Path) -> None:
@@ -431,10 +450,11 @@ def test_warns_about_a_rated_range_without_its_reflectivity(street: Path) -> Non
 def test_check_command_without_findings_writes_nothing(street: Path, run_egvs) -> None:
     before = sorted(street.rglob("*"))
     code, printed, _ = run_egvs("check", street)
-    assert (code, printed.splitlines()) == (
-        0,
-        ["no errors or warnings", "checked 2 sites, 3 solids and 2 lanes"],
-    )
+    _, *poles, _, verdict, counts = printed.splitlines()
+    assert (code, verdict, counts) == (0, "no errors or warnings", "checked 2 sites, 3 solids and 2 lanes")
+    assert [line.split()[:5] for line in poles] == [
+        ["pole_a", "10.0", "12.0", "8.8", "5.7"], ["pole_b", "30.5", "-12.0", "8.8", "21.1"],
+    ]  # fmt: skip
     assert sorted(street.rglob("*")) == before
 
 
@@ -540,23 +560,6 @@ def test_reports_warnings_as_well_as_errors(street: Path, run_egvs) -> None:
     assert error.startswith("egvs: ") and "the network has no edge 'north'" in error
 
 
-@pytest.mark.slow
-@pytest.mark.system
-def test_rejects_map_that_netconvert_rejects(street: Path, monkeypatch: pytest.MonkeyPatch, run_egvs) -> None:
-    (street / "map.osm").write_text('<osm version="0.6"></osm>')
-    monkeypatch.chdir(street.parent)
-    code, _, err = run_egvs("check", street.name, "--set", 'traffic.network="map.osm"')
-    assert (code, err) == (2, "")
-    code, _, err = run_egvs("run", street.name, "--set", 'traffic.network="map.osm"', "--out", "out")
-    assert code == 2
-    assert f"\negvs: {street.name}/map.osm: no network can be built from this map: netconvert ended with" in err
-    assert not list((street.parent / "out").glob("*.p*"))
-    (street / "map.osm").write_text("<osm><node")
-    code, _, err = run_egvs("run", street.name, "--set", 'traffic.network="map.osm"', "--out", "out")
-    assert code == 2
-    assert f"egvs: {street.name}/map.osm: is not well-formed XML: unclosed token" in err
-
-
 def test_reports_counts_at_unknown_edges_and_kinds(street: Path) -> None:
     counts = (
         '[{edge="east",per_hour=100},{edge="north",per_hour=9},{from_edge="east",to_edge="up",per_hour=9,kind="ox"}]'
@@ -606,35 +609,16 @@ def test_changed_input_repeats_check(street: Path) -> None:
     assert key() != before
 
 
-def test_map_is_converted_once(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The check, the rule of sites and the traffic all need the network of a map."""
-    calls = []
-
-    def netconvert(name: str, arguments: list[str], folder: Path) -> str:
-        calls.append(name)
-        (folder / arguments[-1]).write_text((street / "net.net.xml").read_text())
-        return ""
-
-    monkeypatch.setattr(sumo, "run_program", netconvert)
-    (street / "map.osm").write_text("<osm/>")
-    rule(street, "{ low_m=[6,-6], high_m=[26,9], spacing_m=5, heights_m=[3.0] }")
-    scenario = egvs.load(street, ['traffic.network="map.osm"'])
-    assert check.check_scenario(scenario).lanes == 2
-    egvs.build_scene(scenario)
-    sumo_folder.convert_osm_to_network(street / "map.osm", street / "again.net.xml")
-    assert (street / "again.net.xml").read_text() == (street / "net.net.xml").read_text()
-    (street / "map.osm").write_text("<osm> </osm>")
-    sumo_folder.read_network(scenario)
-    assert calls == ["netconvert", "netconvert"]
-
-
-def test_map_as_network_gets_a_warning_that_names_egvs_new(street: Path) -> None:
-    (street / "map.osm").write_text("<osm/>")
-    scenario = egvs.load(street, ['traffic.network="map.osm"'])
-    (finding,) = traffic_checks.warn_map_as_network(CheckInputs(scenario, complete=None))
-    assert not finding.is_error
-    assert "Make the network with egvs new NAME --from map.osm" in str(finding)
-    assert not list(traffic_checks.warn_map_as_network(CheckInputs(egvs.load(street))))
+@pytest.mark.parametrize("text", ["<osm/>", "<OpenDRIVE/>", "\0\0\0\rOSMHeader"])
+@pytest.mark.parametrize("key", ["network", "roads"])
+def test_rejects_map_as_network(street: Path, text: str, key: str) -> None:
+    """By its content, whatever its name."""
+    (street / "map.xml").write_text(text)
+    traffic = {"network": 'network = "map.xml"', "roads": 'fcd = "fcd.csv"\nroads = "map.xml"'}
+    scenario = street / "scenario.toml"
+    scenario.write_text(scenario.read_text().replace('network = "net.net.xml"', traffic[key]))
+    errors = [line for lines in found(street).values() for line in lines]
+    assert errors == ["map.xml: expected a SUMO network, got a map"]
 
 
 # ---- the scene alone

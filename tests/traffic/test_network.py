@@ -1,5 +1,6 @@
 """Reading SUMO networks."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -66,11 +67,6 @@ def test_rejects_invalid_shape_when_it_is_used(tmp_path):
         _ = network.read_net_xml(path).edges[1].lanes[0].shape_m
 
 
-def test_recognises_openstreetmap_files_by_name():
-    names = ["a.osm", "a.osm.xml", "a.osm.gz", "a.osm.xml.gz", "a.osm.pbf", "a.net.xml", "a.net.xml.gz"]
-    assert [network.is_osm(Path(name)) for name in names] == [True] * 5 + [False] * 2
-
-
 @pytest.mark.parametrize("far", ["2147483648", "-1e300", "nan", "inf"])
 def test_rejects_coordinates_beyond_the_earth(tmp_path: Path, far: str) -> None:
     """Of a road; of a lane that is not a road's, when somebody asks for it."""
@@ -81,6 +77,20 @@ def test_rejects_coordinates_beyond_the_earth(tmp_path: Path, far: str) -> None:
     shape = network.Shape(f"0,0 {far},1", "n.net.xml: lane x")
     with pytest.raises(InputError, match=rf"n.net.xml: lane x: invalid coordinates in a shape \(the coordinate {far}"):
         _ = shape.shape_m
+
+
+def test_speed_limit_of_zero_closes_a_lane(tmp_path: Path) -> None:
+    path = tmp_path / "n.net.xml"
+    text = '<net><edge id="e" from="a" to="b"><lane id="e_0" speed="{}" length="20" shape="0,0 20,0"/></edge></net>'
+    path.write_text(text.format("0"))
+    (edge,) = network.read_net_xml(path).edges
+    assert (edge.lanes_for("passenger"), edge.seconds) == (0, math.inf)
+    path.write_text(text.format("10"))
+    (edge,) = network.read_net_xml(path).edges
+    assert (edge.lanes_for("passenger"), edge.seconds) == (1, 2.0)
+    path.write_text(text.format("-10"))
+    with pytest.raises(InputError, match=r"n\.net\.xml: invalid <edge id='e'>.*'e_0' has .* the speed -10"):
+        network.read_net_xml(path)
 
 
 def test_rejects_ground_with_too_many_points(tmp_path: Path) -> None:

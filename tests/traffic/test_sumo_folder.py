@@ -11,7 +11,7 @@ from egvs.scenario.loading import load
 from egvs.stages import traffic
 from egvs.traffic import demand, network
 from tests.stage_runner import inputs_of, run_stage
-from tests.traffic.helpers import SMALL, car, drawn, scenario, scenario_with_config
+from tests.traffic.helpers import car, drawn, scenario, scenario_with_config
 
 
 def nothing(folder):
@@ -60,7 +60,7 @@ BAD = {
         write("m.osm.pbf", "OSMHeader"),
         {"network": "m.osm.pbf"},
         InputError,
-        r"m\.osm\.pbf: cannot be read as OpenStreetMap data",
+        r"m\.osm\.pbf: expected a SUMO network, got a map\. Run egvs new NAME --from m\.osm\.pbf",
     ),
     "no routes": (
         nothing,
@@ -266,24 +266,6 @@ def test_user_configuration_runs_with_times_and_outputs_of_the_scenario(town, tm
         "more/red.add.xml",
     }
     assert result["vehicles"]["different"] > 20
-
-
-OSM = """<osm version="0.6"><bounds minlat="52.0" minlon="10.0" maxlat="52.004" maxlon="10.004"/>
-{nodes}
-<way id="1"><nd ref="1"/><nd ref="2"/><nd ref="3"/><tag k="highway" v="secondary"/></way>
-<way id="2"><nd ref="4"/><nd ref="2"/><nd ref="5"/><tag k="highway" v="secondary"/></way></osm>
-"""
-
-
-def test_converts_openstreetmap_map(tmp_path):
-    where = [(52.002, 10.0), (52.002, 10.002), (52.002, 10.004), (52.0, 10.002), (52.004, 10.002)]
-    nodes = "".join(f'<node id="{i}" lat="{lat}" lon="{lon}"/>' for i, (lat, lon) in enumerate(where, 1))
-    (tmp_path / "cross.osm").write_text(OSM.replace("{nodes}", nodes))
-    result = run_stage(
-        traffic, scenario(tmp_path, **(SMALL | {"network": "cross.osm", "vehicles": 6})), tmp_path / "out"
-    )
-    assert result["vehicles"]["fewest"] == 6
-    assert (tmp_path / "out" / "sumo" / "network.net.xml").is_file()
 
 
 def test_inputs_of_the_stage(town, tmp_path):

@@ -264,10 +264,11 @@ def test_rejects_entities_in_demand_files(demand_folder, tmp_path, which):
     assert not (tmp_path / "out" / "trajectories.parquet").exists()
 
 
-def test_rejects_entities_in_a_map(demand_folder, tmp_path):
-    (demand_folder / "map.osm").write_text(BOMB.replace("routes", "osm"))
-    with pytest.raises(InputError, match=r"map\.osm: declares XML entities"):
-        run_stage(traffic, scenario(demand_folder, network="map.osm", **THREE_FRAMES), tmp_path / "out")
+def test_rejects_map_that_a_configuration_names(demand_folder, tmp_path):
+    scene = scenario_with_options(demand_folder)
+    (demand_folder / "net.xml").write_text("<osm/>")
+    with pytest.raises(InputError, match=r"net\.xml: expected a SUMO network, got a map"):
+        run_stage(traffic, scene, tmp_path / "out")
 
 
 @pytest.mark.parametrize(

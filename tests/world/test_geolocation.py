@@ -17,7 +17,7 @@ from egvs.core.sumo_home import sumo_home
 from egvs.formats import osm
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
-from egvs.traffic import network, sumo_folder
+from egvs.traffic import network, sumo
 from egvs.traffic.network import Location
 from egvs.world import geolocation
 
@@ -49,7 +49,9 @@ UTM = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
 @pytest.mark.parametrize("map_file", [SMALL, pytest.param(REAL, marks=pytest.mark.skipif(
     not REAL.is_file(), reason="bad_hersfeld.osm is not beside the checkout (shared/real)"))])  # fmt: skip
 def test_junctions_are_at_their_map_nodes(tmp_path: Path, map_file: Path) -> None:
-    sumo_folder.convert_osm_to_network(map_file, tmp_path / "n.net.xml")
+    map_path = tmp_path / "m.osm"
+    map_path.write_bytes(map_file.read_bytes())
+    sumo.run_netconvert(["--osm-files", map_path.name, "--junctions.join"], tmp_path, "n.net.xml")
     world = geolocation.scenario_georeference(load(tmp_path, {"network": "n.net.xml"}))
     assert world.frame is not None
     nodes = osm.read_osm(map_file).nodes
@@ -63,17 +65,6 @@ def test_junctions_are_at_their_map_nodes(tmp_path: Path, map_file: Path) -> Non
     back = world.lon_lat_deg(junctions)
     assert back is not None
     assert np.median(np.abs(back - lon_lat_deg)) < 2e-7
-
-
-@pytest.mark.system
-def test_map_has_frame_of_its_converted_network(tmp_path: Path) -> None:
-    sumo_folder.convert_osm_to_network(SMALL, tmp_path / "n.net.xml")
-    (tmp_path / "m.osm.xml").write_bytes(SMALL.read_bytes())
-    by_net, by_map = (load(tmp_path, {"network": name}) for name in ("n.net.xml", "m.osm.xml"))
-    assert (
-        geolocation.scenario_georeference(by_map).frame == geolocation.scenario_georeference(by_net).frame is not None
-    )
-    assert geolocation.world_frame_settings(by_map)["world_frame"].keys() == {"map", "sumo"}
 
 
 def test_agrees_with_sumolib_on_real_network(tmp_path: Path) -> None:

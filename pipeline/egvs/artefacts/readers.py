@@ -72,7 +72,7 @@ class LocationVisibility:
         share = format_percent(self.share, 0)
         if not math.isnan(self.se):
             share = f"{100 * self.share:.0f} ± {100 * self.se:.0f} %"
-        return f"{self.words} ({share} of {self.vehicles:,} vehicles)"
+        return f"{self.words} ({share} of {self.vehicles:,} vehicles found)"
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,8 @@
-"""What ``egvs run`` prints at its end: the answer to "which pole?" in a few lines.
-
-First the verdict, then the best poles, each with its best mount, the lanes where the best site finds fewest vehicles,
-what was assumed, further reasons to be careful, and the path of the report.
-"""
+"""What ``egvs run`` prints at its end: the answer to "which pole?" in a few lines, or with all that is known."""
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -15,13 +12,19 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from egvs.artefacts import parquet
+from egvs.artefacts import parquet, readers
 from egvs.artefacts.readers import PeriodRanking
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.cli import stage_summary
-from egvs.cli.console import Column, console, make_table, print_sentences
-from egvs.cli.options import DEFAULT_POLES
+from egvs.cli.console import (
+    LINE_WIDTH,
+    Column,
+    console,
+    make_table,
+    print_sentences,
+    wrap_lines,
+)
 from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import by_number, number_of
 from egvs.report import ranking_text, reliability, sections
@@ -29,12 +32,20 @@ from egvs.report.extension_sections import read_sections
 from egvs.report.sensor_text import detection_level, has_losses, range_note, upper_limit_note
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
 from egvs.results.levels import NO_DETECTORS, DetectionLevel, read_levels
-from egvs.results.ranking import Pole, RankedSite, Ranking
+from egvs.results.ranking import Pole, RankedSite, Ranking, describe_mount, site_titles
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import NOTICED
+from egvs.sensors import sites
 from egvs.traffic.signal_descriptions import format_plan
 
 _FILE_WIDTH = 150
+
+MAX_LINES = 12
+"""Lines of an answer without details, with those of the most serious warning."""
+
+MIN_POLES, DEFAULT_POLES = 3, 5
+"""Poles that are listed at least, and at most, unless another number is asked for."""
+
 _MAX_SIGNALS = 2
 """Further signals are left to the report."""
 
@@ -42,8 +53,16 @@ _MAX_PERIODS = 4
 """With more periods, their ranks are left to ``--all`` and the report."""
 
 
-def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: int | None = DEFAULT_POLES) -> None:
-    """Print the answer of a finished run.
+def print_answer(
+    folder: Path,
+    scenario: Scenario,
+    record: RunRecord,
+    *,
+    poles: int | None = None,
+    with_details: bool = False,
+    lines_before: int = 0,
+) -> None:
+    """Print the answer of a finished run: in at most :data:`MAX_LINES` lines, or all that is known.
 
     Parameters
     ----------
@@ -52,18 +71,69 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     scenario, record
         Its scenario and its record.
     poles
-        How many of the best poles are listed; None for all.
+        How many of the best poles are listed; None for as many as there is room for, with details for all.
+    with_details
+        Whether all that is known is printed.
+    lines_before
+        Number of lines with warnings that were printed before.
     """
-    out = console(_FILE_WIDTH)
     run_folder = RunFolder(folder)
     ranked = Ranking.read(run_folder.scores)
-    summary = record.stages["score"].summary
-    out.print()
-    if ranked.best[0].score > 0:
-        _print_ranking(out, folder, ranked, scenario, record, poles)
+    if not ranked.best[0].score > 0:
+        for warning in collect_warnings([record.stages["score"].summary]):
+            print_sentences([str(warning)])
+        print_sentences([f"report: {run_folder.report}"])
+    elif with_details:
+        _print_details(run_folder, ranked, scenario, record, poles)
     else:
-        for warning in collect_warnings([summary]):
-            out.print(str(warning))
+        _print_short(run_folder, ranked, scenario, record, poles, MAX_LINES - lines_before)
+
+
+def _print_short(
+    folder: RunFolder, ranked: Ranking, scenario: Scenario, record: RunRecord, poles: int | None, max_lines: int
+) -> None:
+    """Print the best site and its lead, the best poles, the worst lane, what was assumed, and where the rest is."""
+    best = ranked.best[0]
+    has_relief = sites.has_relief(scenario)
+    groups = read_levels(folder.levels, ranked.sites[0].site)
+    found = detection_level(scenario, scenario.score.ranking_detectors, ranked.sites[0].sensor, groups)
+    titles = site_titles(ranked.sites, has_relief=has_relief)
+    headline = ranking_text.headline(ranked, has_traffic=True, found=found, titles=titles)
+    before = wrap_lines(f"{headline}. {ranking_text.short_lead(ranked)}")
+    for part in read_sections(folder, scenario, record.stages):
+        for warning in part.warnings:
+            before += wrap_lines(warning.sentence)
+    after = []
+    if record.stages["score"].summary.get("missed") and (worst := _worst_location(folder, best)):
+        after += wrap_lines(f"Worst lane: {worst}.", 1)
+    plans = record.traffic_summary.get("signals", ())
+    if assumed := sections.main_assumptions(sections.assumptions(scenario, plans)):
+        after += wrap_lines(assumed, 1)
+    after.append(f"report: {folder.report} (has everything; --verbose prints it)")
+    room = max_lines - len(before) - len(after) - 1
+    count = poles or min(DEFAULT_POLES, max(MIN_POLES, room))
+    out = console(LINE_WIDTH, soft_wrap=False)
+    for line in before:
+        out.print(line)
+    out.print(_short_table(ranked, PeriodRanking.read(folder.path), count, has_relief))
+    for line in after:
+        out.print(line, soft_wrap=True)  # a path that is broken into lines cannot be copied
+
+
+def _worst_location(folder: RunFolder, best: RankedSite) -> str:
+    """Return the lane, turn or crossing where the smallest share of vehicles is found; empty if none is below all."""
+    for blindspots in readers.read_blindspots(folder.blindspots, {best.site}):
+        return next((location.in_words() for location in blindspots.worst), "")
+    return ""
+
+
+def _print_details(
+    folder: RunFolder, ranked: Ranking, scenario: Scenario, record: RunRecord, poles: int | None
+) -> None:
+    """Print all that is known of the ranking."""
+    out = console(_FILE_WIDTH)
+    out.print()
+    _print_ranking(out, folder.path, ranked, scenario, record, poles)
     traffic_summary = record.traffic_summary
     plans = traffic_summary.get("signals", ())
     sentences = signal_sentences(plans)
@@ -77,9 +147,11 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     if note := range_note(sensors, is_modelled=has_losses(scenario, sensors)):
         sentences.append(note)
     print_sentences(sentences)
-    if ranked.best[0].score > 0 and len(set(sensors)) == 1:
-        out.print(f"Which sensor? {shlex.join(['egvs', 'compare', str(folder), '--sensors', 'NAME,NAME'])} (or all)")
-    out.print(f"report: {run_folder.report}")
+    if len(set(sensors)) == 1:
+        out.print(
+            f"Which sensor? {shlex.join(['egvs', 'compare', str(folder.path), '--sensors', 'NAME,NAME'])} (or all)"
+        )
+    out.print(f"report: {folder.report}")
 
 
 def signal_sentences(plans: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -122,9 +194,6 @@ def _print_ranking(
         print_sentences([f"Vehicles are weighted: {summary['weights']}."])
     out.print()
     out.print(poles_table(ranked, PeriodRanking.read(folder), poles))
-    if poles is not None and len(ranked.poles) > poles:
-        others = len(ranked.poles) - poles
-        out.print(f"{number_of(others, 'more pole')}: --all lists all")
     out.print()
     if location := _location(ranked.best[0]):
         out.print(location)
@@ -187,6 +256,32 @@ def poles_table(ranked: Ranking, by_period: PeriodRanking | None, count: int | N
     if by_period is not None and len(by_period.periods) <= _MAX_PERIODS:
         columns += _period_columns(by_period)
     return make_table(columns, poles)
+
+
+def _short_table(ranked: Ranking, by_period: PeriodRanking | None, count: int, has_relief: bool) -> Table:
+    """Return the best poles with what differs most: mount, score, distance to the best one, and ranks by period."""
+    best, poles = ranked.best[0], ranked.poles[:count]
+
+    def behind(pole: Pole) -> str:
+        if pole.best.score == best.score:
+            return "-"
+        se = math.nan if pole.best.behind_best_se is None else pole.best.behind_best_se
+        return ranked.by.change(best.score - pole.best.score, se)
+
+    columns = [
+        Column[Pole]("", lambda pole: str(1 + poles.index(pole))),
+        Column[Pole]("pole", lambda pole: pole.name, "left"),
+        Column[Pole]("best mount", lambda pole: describe_mount(pole.best, has_relief=has_relief), "left"),
+    ]
+    if len({site.sensor for site in ranked.sites}) > 1:
+        columns.append(Column("sensor", lambda pole: pole.best.sensor, "left"))
+    columns.append(Column(ranked.by.head, lambda pole: ranked.by.value(pole.best.score)))
+    columns.append(Column(f"behind, {ranked.by.change_head}".rstrip(", "), behind))
+    if ranked.has_noticed:
+        columns.append(Column(SCORE_LABELS[NOTICED].head, lambda pole: pole.best.noticed_cell))
+    if by_period is not None and len(by_period.periods) <= _MAX_PERIODS:
+        columns += _period_columns(by_period)
+    return make_table(columns, poles, truncate=True)
 
 
 def _mount_columns(sites: Sequence[RankedSite], poles: Sequence[Pole]) -> list[Column[Pole]]:

@@ -19,7 +19,6 @@ from egvs.cli import environment, exit
 from egvs.cli import options as cli_options
 from egvs.cli.commands import ExtensibleGroup
 from egvs.cli.options import (
-    DEFAULT_POLES,
     Audit,
     Detector,
     Jobs,
@@ -35,6 +34,7 @@ from egvs.cli.options import (
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
+    from egvs.creation.new_scenario import NewScenarioOptions
     from egvs.scenario.model import Scenario
     from egvs.studies.effect_study import EffectStatus
 
@@ -92,8 +92,13 @@ def run(
     set_: Set = None,
     jobs: Jobs = None,
     audit: Audit = False,
-    top: Annotated[int, typer.Option("--top", metavar="N", min=1, help="Number of poles to print.")] = DEFAULT_POLES,
+    top: Annotated[
+        int | None, typer.Option("--top", metavar="N", min=1, help="Number of poles to print; by default 3 to 5.")
+    ] = None,
     all_: Annotated[bool, typer.Option("--all", help="Print the complete ranking of all sites and poles.")] = False,
+    count: Annotated[
+        int | None, typer.Option(metavar="K", min=1, help="Afterwards plan at most K sensors, as egvs place does.")
+    ] = None,
     verbose: Verbose = False,
     rehash: Rehash = False,
 ) -> None:
@@ -101,7 +106,7 @@ def run(
     from egvs.cli.console import ProgressDisplay
 
     stage_options = {"score": {"audit": True}} if audit else None
-    with ProgressDisplay("run", with_details=verbose) as screen:
+    with ProgressDisplay("run", with_details=verbose, is_run=True) as screen:
         from egvs.cli import answer, run_tables
         from egvs.runs.run import run, run_rehashed
 
@@ -111,14 +116,21 @@ def run(
         record = run_all(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
-    if not screen.any_stage_ran:
-        screen.say("no stage ran: no input has changed since the last run")
+        if not screen.any_stage_ran:
+            screen.say("no stage ran: no input has changed since the last run")
     if all_:
         run_tables.print_scores(folder, loaded, record, before_answer=True)
     if verbose:
         run_tables.print_costs(folder, record)
     run_tables.print_audit(record)
-    answer.print_answer(folder, loaded, record, poles=None if all_ else top)
+    answer.print_answer(
+        folder, loaded, record, poles=top, with_details=verbose or all_, lines_before=screen.warning_lines
+    )
+    if count is not None:
+        from egvs.cli.place import place
+
+        print()
+        place(folder, count=count, jobs=jobs)
 
 
 @app.command()
@@ -131,7 +143,7 @@ def demo(
     """Try it: rank eight sites at a roundabout in about a minute, with traffic simulated in advance."""
     from egvs.cli.console import ProgressDisplay
 
-    with ProgressDisplay("demo") as screen:
+    with ProgressDisplay("demo", is_run=True) as screen:
         from egvs.cli import answer, run_tables
         from egvs.runs.run import run
         from egvs.scenario import shipped
@@ -141,7 +153,7 @@ def demo(
         results, loaded = folder / "results", load(folder)
         screen.flow_source = answer.flow_source(loaded)
         record = run(loaded, results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
-    answer.print_answer(results, loaded, record)
+    answer.print_answer(results, loaded, record, lines_before=screen.warning_lines)
     run_tables.print_demo_hints(results)
 
 
@@ -150,17 +162,18 @@ def check(
     scenario: SettingsPath,
     set_: Set = None,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Also print what protects this machine from the scenario's files.")
+        bool,
+        typer.Option("--verbose", help="Print all poles, and what protects this machine from the scenario's files."),
     ] = False,
 ) -> None:
-    """Check a scenario before a run, and print all errors and warnings. No files are written."""
+    """Check a scenario before a run: print where the poles stand, all errors and warnings. No files are written."""
     from egvs.cli import run_tables
     from egvs.core import sandbox
     from egvs.runs.run_sources import SettingsSource
     from egvs.stages import check
 
     checked = check.check_scenario(SettingsSource.of(scenario, set_).load())
-    run_tables.print_check(checked)
+    run_tables.print_check(checked, with_details=verbose)
     if verbose:
         run_tables.print_protections(sandbox.missing_protections())
     if checked.errors:
@@ -552,27 +565,35 @@ def sensors(
             " read.",
         ),
     ] = None,
+    scenario: Annotated[
+        Path | None, typer.Option(metavar="SCENARIO", help="Know the sensors of this scenario, too.")
+    ] = None,
 ) -> None:
     """List the sensor catalogue; with names or files of beams, print the details of these sensors."""
     from egvs.cli import run_tables
+    from egvs.scenario.loading import load
     from egvs.sensors.beam_files import is_beam_file, read_beam_file
-    from egvs.sensors.sensor import CATALOGUE, check_sensor_names
+    from egvs.sensors.sensor import CATALOGUE, check_sensor_names, scenario_sensor
 
+    loaded = None if scenario is None else load(scenario)
+    custom = {} if loaded is None else {name: scenario_sensor(name, loaded, "NAME") for name in loaded.sensors}
     if not names:
-        run_tables.print_sensors(CATALOGUE.values())
+        run_tables.print_sensors([*custom.values(), *CATALOGUE.values()])
         return
     files = {name: read_beam_file(Path(name)) for name in names if is_beam_file(name)}
-    check_sensor_names((name for name in names if name not in files), (), "NAME")
+    check_sensor_names((name for name in names if name not in files), custom, "NAME")
     for name in names:
         if name in files:
             run_tables.print_beam_file(Path(name), files[name])
         else:
-            run_tables.print_sensor_details([CATALOGUE[name]])
+            run_tables.print_sensor_details([custom[name] if name in custom else CATALOGUE[name]])
 
 
 @app.command(cls=cli_options.NewCommand)
 def new(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the new scenario.")],
+    folder: Annotated[
+        Path | None, typer.Argument(metavar="FOLDER", help="Folder of the new scenario; not with --list.")
+    ] = None,
     more: Annotated[
         list[Path] | None, typer.Argument(metavar="[FILE]...", help="Further map files or folders.")
     ] = None,
@@ -718,6 +739,12 @@ def new(
             " height from it.",
         ),
     ] = None,
+    list_: Annotated[
+        bool,
+        typer.Option(
+            "--list", help="List the junctions of the road map: names, arms, signals, --at. Nothing is written."
+        ),
+    ] = False,
     run_: Annotated[
         bool, typer.Option("--run", help="Run the new scenario at once, as egvs run does, up to the ranking.")
     ] = False,
@@ -732,6 +759,19 @@ def new(
     from egvs.creation.new_scenario import NewScenarioOptions
 
     paths = [*(maps or []), *(more or [])]
+    if list_:
+        others = {
+            "--at": at, "--download": download, "--surroundings": surroundings, "--traffic": traffic, "--run": run_,
+            "--vehicles-per-hour": vehicles_per_hour, "--counts": counts, "--poles": poles, "--tracks": tracks,
+            "--like": like, "--signals": signals, "--align": align, "--surface": surface,
+        }  # fmt: skip
+        for option in filter(others.get, others):
+            raise InputError(option, "has no effect with --list", "Remove one of them.")
+        maps_given = [*(maps or []), *([folder] if folder else []), *(more or [])]  # --from A B takes B for the folder
+        _list_junctions(maps_given, NewScenarioOptions(lefthand=lefthand, righthand=righthand, walk=walk))
+        return
+    if folder is None:
+        raise InputError("FOLDER", "no folder is given", "Name the folder of the new scenario, or use --list.")
     if not paths and not download:
         hint = "Give a map of the roads, such as --from town.osm, or --at LAT,LON --download."
         raise InputError("--from", "no map is given", hint)
@@ -774,6 +814,18 @@ def new(
     new_summary.print_new_scenario(scenario, notes)
     if run_:
         run(folder)
+
+
+def _list_junctions(paths: Sequence[Path], options: NewScenarioOptions) -> None:
+    from egvs.cli import new_summary
+    from egvs.cli.console import ProgressDisplay
+    from egvs.creation.new_scenario import list_junctions
+
+    if not paths:
+        raise InputError("--from", "no map is given", "Give a map of the roads, such as --from town.osm.")
+    with ProgressDisplay("new", prints_progress=True) as screen:
+        listed = list_junctions(paths, options, screen.progress)
+    new_summary.print_junctions(listed)
 
 
 @app.command()

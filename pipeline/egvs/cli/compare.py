@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from egvs.cli.options import Top, command_words
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
 
@@ -79,9 +78,12 @@ def compare(
             " Writes a page with both maps.",
         ),
     ] = None,
-    top: Top = None,
+    top: Annotated[
+        int | None,
+        typer.Option("--top", metavar="N", min=1, help="Number of poles, sites or lanes to print; by default 5."),
+    ] = None,
 ) -> None:
-    """Which sensor? Compare sensors or runs: the best mount of each pole, the cost of one more point, and settings."""
+    """Which sensor? Compare sensors or runs: the best mount of each pole, costs, and settings."""
     from egvs.cli.console import ProgressDisplay
 
     overrides = set_ or []
@@ -98,7 +100,6 @@ def compare(
         _compare_heights(runs, overrides)
         return
     costs = list(overrides)
-    command: list[str] = []
     with ProgressDisplay("compare") as screen:
         from egvs.cli import study_tables
         from egvs.studies import run_comparison
@@ -110,9 +111,8 @@ def compare(
             costs = [override for override in overrides if override.strip().startswith(_COSTS)]
             settings = [override for override in overrides if override not in costs]
             folders = _run_sensors(screen, runs, sensors, settings)
-            command = [*command_words("compare", runs[0], settings), _OPTION, sensors]
         comparison = run_comparison.compare_runs(folders, by, costs, screen.progress)
-    study_tables.print_comparison(comparison, top, command)
+    study_tables.print_comparison(comparison, top)
 
 
 def _compare_tpogs(runs: Sequence[Path], page: Path, top: int | None) -> None:

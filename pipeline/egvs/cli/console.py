@@ -5,8 +5,11 @@ Results go to standard output; progress, stage lines and warnings go to standard
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
+import textwrap
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Generic, Literal, TypeVar
@@ -18,8 +21,8 @@ from rich.text import Text
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.cli import stage_summary
-from egvs.core.errors import collect_warnings, escape_control_characters
-from egvs.core.wording import format_percent
+from egvs.core.errors import Diagnostic, collect_warnings, escape_control_characters
+from egvs.core.wording import format_percent, number_of
 
 NARROW, WIDE = 110, 190
 """Terminals below ``NARROW`` columns get fewer columns of tables; those of about ``WIDE`` get all."""
@@ -27,8 +30,14 @@ NARROW, WIDE = 110, 190
 _UNBROKEN_WIDTH = 100_000
 """No sentence is longer."""
 
-MAX_WARNINGS = 3
-"""Warnings that a command prints without details."""
+LINE_WIDTH = 100
+"""Width of the lines of an answer in a file."""
+
+_WARNING_LINES = 2
+"""Lines of the most serious warning, unless all details are printed."""
+
+LINE_INTERVAL_S = 5.0
+"""Least time between two lines about the progress of one step."""
 
 Row = TypeVar("Row")
 
@@ -79,6 +88,13 @@ def print_sentences(sentences: Iterable[str]) -> None:
     out = console(_UNBROKEN_WIDTH, soft_wrap=False)
     for sentence in sentences:
         out.print(sentence)
+
+
+def wrap_lines(text: str, most: int | None = None) -> list[str]:
+    """Return a text in lines of at most :data:`LINE_WIDTH` characters; what follows the last line is cut off ("…")."""
+    return textwrap.wrap(
+        text, LINE_WIDTH, max_lines=most, placeholder=" …", break_long_words=False, break_on_hyphens=False
+    )
 
 
 def make_table(
@@ -160,25 +176,34 @@ class ProgressDisplay:
     verb
         Name of the command, until a stage begins.
     with_details
-        Whether all that a stage reports is printed, and every warning; otherwise one short line for each stage, and the
-        first :data:`MAX_WARNINGS` warnings.
+        Whether all that a stage reports is printed, and every warning; otherwise one short line for each stage, and at
+        the end the number of warnings and the most serious one.
+    is_run
+        Whether unchanged stages have a line, and their warnings are reported like those of others; otherwise only their
+        number is printed.
+    prints_progress
+        Whether progress is printed where there is no terminal: a line for each new step, else every
+        :data:`LINE_INTERVAL_S`.
 
     Attributes
     ----------
     any_stage_ran
         Whether at least one stage was run or restored from the cache.
-    hidden_warnings
-        Number of warnings that were not printed.
+    warning_lines
+        Number of lines that were printed at the end, about warnings.
     flow_source
         What the simulated flows are compared with; set by commands that know the scenario.
     """
 
-    def __init__(self, verb: str = "", *, with_details: bool = False) -> None:
+    def __init__(
+        self, verb: str = "", *, with_details: bool = False, is_run: bool = False, prints_progress: bool = False
+    ) -> None:
         self.any_stage_ran = False
-        self.hidden_warnings = 0
+        self.warning_lines = 0
         self.flow_source = stage_summary.FLOWS
         self._with_details = with_details
-        self._warnings: set[str] = set()
+        self._is_run = is_run
+        self._warnings: dict[Diagnostic, bool] = {}  # and whether it is to be printed
         self._stage = verb
         self._part = ""
         self._part_seconds = 0.0
@@ -193,25 +218,52 @@ class ProgressDisplay:
         )
         self._task = self._bar.add_task(verb, total=None)
         self._has_bar = sys.stderr.isatty()
+        self._prints_progress = prints_progress and not self._has_bar
+        self._begin_s = time.monotonic()
+        self._last_line = ("", -math.inf)
 
     def __enter__(self) -> ProgressDisplay:
         if self._has_bar:
             self._bar.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         if self._has_bar:
             self._bar.stop()
-        if self.hidden_warnings:
-            self.say(f"more warnings: {self.hidden_warnings}; the report and egvs run --verbose list them")
+        lines = list(self._describe_warnings())
+        self.warning_lines = len(lines)
+        for line in lines:
+            self.say(line)
+        if self._is_run and error is None:
+            self.say("")  # before the answer
+
+    def _describe_warnings(self) -> Iterator[str]:
+        """Yield the most serious of the warnings that were not printed, and how many there are."""
+        new = [warning for warning, is_new in self._warnings.items() if is_new]
+        if new and not self._with_details:
+            from egvs.report.reliability import by_severity
+
+            count = "warning" if len(new) == 1 else f"{len(new)} warnings; the most serious"
+            yield from wrap_lines(f"{count}: {by_severity(new)[0]}", _WARNING_LINES)
+        if known := len(self._warnings) - len(new):
+            yield f"{number_of(known, 'warning')}, as in the run"
 
     def progress(self, what: str, done: int, total: int) -> None:
         """Move the bar; a :data:`egvs.core.progress.ProgressCallback`."""
+        if self._prints_progress:
+            self._print_progress(what, done, total)
         if not self._has_bar:
             return
-        count = f"{done}/{total}" if total else str(done)
+        count = f"{done}/{total}" if total else str(done or "")
         self._bar.update(self._task, description=f"{self._part}{self._stage}: {what} {count}", completed=done)
         self._bar.tasks[0].total = total or None  # update() takes None for "unchanged"
+
+    def _print_progress(self, what: str, done: int, total: int) -> None:
+        now_s = time.monotonic() - self._begin_s
+        if what == self._last_line[0] and now_s - self._last_line[1] < LINE_INTERVAL_S:
+            return
+        self._last_line = (what, now_s)
+        self.say(f"{now_s:4.0f} s  {what} {f'{done}/{total}' if total else done or ''}".rstrip())
 
     def begin_part(self, title: str) -> None:
         """Begin one of several runs of a command: its stages are shown on the bar only, after the title."""
@@ -235,7 +287,7 @@ class ProgressDisplay:
     def stage_event(self, stage: str, state: str, record: StageRecord | None) -> None:
         """Print one line when a stage ends; a :data:`egvs.runs.run.StageListener`.
 
-        A warning is printed once, also if several stages or runs have it.
+        A warning is reported once, also if several stages or runs have it.
         """
         self._stage = stage
         self._part_states.add(state)
@@ -249,16 +301,13 @@ class ProgressDisplay:
 
         if state == "done":
             self._part_seconds += record.cost.seconds
-        if not self._part:
+        if not self._part and (state != "skipped" or self._is_run or self._with_details):
             self._print_stage(stage, state, record)
-        for warning in map(str, collect_warnings([record.summary])):
-            if warning in self._warnings:
-                continue
-            self._warnings.add(warning)
-            if len(self._warnings) > MAX_WARNINGS and not self._with_details:
-                self.hidden_warnings += 1
-            else:
+        is_new = state in ("done", "fetched") or self._is_run
+        for warning in collect_warnings([record.summary]):
+            if is_new and not self._warnings.get(warning) and self._with_details:
                 self.say(f"warning: {warning}")
+            self._warnings[warning] = self._warnings.get(warning, False) or is_new
 
     def _print_stage(self, stage: str, state: str, record: StageRecord) -> None:
         lines = stage_summary.stage_lines(

@@ -33,7 +33,7 @@ def place(
     out: Out = None,
     count: Annotated[int | None, typer.Option(metavar="K", help="Find the best plan of at most K sensors.")] = None,
     budget: Annotated[
-        float | None, typer.Option(metavar="COST", help="Find the best plan within this total cost (see \\[costs]).")
+        str | None, typer.Option(metavar="COST", help="Find the best plan within this total cost (see \\[costs]).")
     ] = None,
     reach: Annotated[
         float | None,
@@ -59,10 +59,11 @@ def place(
     from egvs.cli.console import ProgressDisplay
 
     limit_s = options.duration_s(time_limit, "--time-limit")
-    _check_request(count, budget, reach)
+    _check_request(count, reach)
+    total_cost = None if budget is None else options.cost(budget)
     overrides = options.with_detector(set_, detector, scenario)
     request = []
-    for key, value in zip(_REQUEST_KEYS, (count, budget, reach), strict=True):
+    for key, value in zip(_REQUEST_KEYS, (count, total_cost, reach), strict=True):
         if value is not None:
             request.append(f"placement.{key}={value!r}")
     loaded, folder = sources.open_source(scenario, overrides, out, request)
@@ -84,18 +85,16 @@ def place(
     if exact and not (placed.is_best or placed.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
     plans = RunRecord.read(folder).traffic_summary.get("signals", ())
-    caveats = [sections.describe_caveats(loaded, "plan", plans=plans)]
+    caveats = [sections.main_assumptions(sections.assumptions(loaded, plans))]
     if placed.fused is not None and placed.fused.noticed is not None:
         caveats.append(sensor_text.upper_limit_note(loaded, [sensor.sensor for sensor in placed.sensors]))
     print_placement(placed, notes, [caveat for caveat in caveats if caveat])
 
 
-def _check_request(count: int | None, budget: float | None, reach: float | None) -> None:
+def _check_request(count: int | None, reach: float | None) -> None:
     """InputError for an option whose value is out of range."""
     if count is not None and count < 1:
         raise InputError("--count", f"expected at least 1 sensor, got {count}", "Use a number such as 3.")
-    if budget is not None and not 0 < budget < math.inf:
-        raise InputError("--budget", f"expected a cost above 0, got {budget:g}", "Use the total cost, such as 20000.")
     if reach is not None and not 0 < reach <= 1:
         hint = "Use a share such as 0.95."
         if 1 < reach <= 100:
@@ -119,13 +118,14 @@ def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveats: Sequ
     from egvs.cli.console import WIDE, console, print_sentences
 
     out = console(WIDE, soft_wrap=False)
+    print_sentences([describe_plan(placed)])
     out.print(_sensor_table(placed, out.width))
     if any(sensor.forced for sensor in placed.sensors):
         out.print("* already installed")
-    out.print()
-    out.print(_curve_table(placed, out.width))
+    if other := _other_plans(placed):
+        out.print()
+        out.print(_curve_table(placed, other, out.width))
     print_sentences([describe_errors(placed)])
-    out.print()
     for zone in placed.zones:
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
         out.print(
@@ -134,9 +134,17 @@ def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveats: Sequ
         )
     if worst := worst_zones(placed.zone_results):
         print_sentences([describe_worst_zones("the plan", worst)])
-    print_sentences([describe_plan(placed), *notes, *_further_sentences(placed), *caveats])
+    print_sentences([*notes, *_further_sentences(placed), *caveats])
     for path in placed.files:
         out.print(str(path), soft_wrap=True)
+
+
+def _other_plans(placed: SensorPlan) -> list[PlanStep]:
+    """Return the best plans of fewer sensors that are not the first sensors of the plan, which its table has."""
+    if placed.refinement is not None:
+        return list(placed.curve)
+    sites = [sensor.site for sensor in placed.sensors]
+    return [step for step in placed.curve if set(step.sites) != set(sites[: len(step.sites)])]
 
 
 def _further_sentences(placed: SensorPlan) -> Iterator[str]:
@@ -167,24 +175,22 @@ def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
     by
         Label of the joint score.
     """
+    from egvs.results.labels import join_names
+
     noticed = f"People would notice {fused.noticed.text} of vehicles" if fused.noticed is not None else ""
     if len(fused.steps) == 1:
         return f"{noticed} in the sweeps of this sensor." if noticed else ""
-    first, *further = (by.with_error(step.score, step.score_se) for step in fused.steps)
-    values = [f"{first} with the first sensor"]
-    values += [f"{value} with {step.count}" for step, value in zip(fused.steps[1:], further, strict=True)]
-    last = by.change(fused.steps[-1].gain, fused.steps[-1].gain_se)
-    text = (
-        f"Found where all point clouds are fused before detection: {', '.join(values)} (the last one adds {last} "
-        f"{by.change_unit})"
-    )
+    counts = join_names([str(step.count) for step in fused.steps])
+    values = join_names([by.with_unit(step.score, step.score_se) for step in fused.steps])
+    last = f"{by.change(fused.steps[-1].gain, fused.steps[-1].gain_se)} {by.change_unit}"
+    text = f"In fused clouds, the first {counts} sensors find {values}; the last one adds {last}"
     if noticed:
         noticed = f" {noticed} there."
     if fused.better is not None:
         gain = by.change(fused.better.gain, fused.better.gain_se)
         return f"{text}; {', '.join(fused.better_sites)} should find {gain} {by.change_unit} more there.{noticed}"
     if fused.searched:
-        return f"{text}; swapping a single sensor finds no more there.{noticed}"
+        return f"{text}; no swap of one sensor finds more.{noticed}"
     return f"{text}.{noticed}"
 
 
@@ -211,21 +217,19 @@ def _sensor_table(placed: SensorPlan, width: int) -> Table:
     return make_table(columns, placed.sensors)
 
 
-def _curve_table(placed: SensorPlan, width: int) -> Table:
+def _curve_table(placed: SensorPlan, steps: Sequence[PlanStep], width: int) -> Table:
     from egvs.cli.console import Column, make_table
 
     by, head = placed.by, partial(_head, width)
     columns: list[Column[PlanStep]] = [
         Column("sensors", lambda step: str(step.count)),
         Column(head(_together_head(by)), lambda step: by.with_error(step.score, step.score_se)),
-        Column(head("adds", by.change_head), lambda step: by.change(step.gain, step.gain_se)),
-        Column(head("of all candidates"), lambda step: format_percent(placed.share_of_all(step.score))),
-        Column(head("proved, of the best possible"), lambda step: _format_rounded_down(step.certificate)),
+        Column("proved", lambda step: _format_rounded_down(step.certificate)),
     ]
     if any(step.cost for step in placed.curve):
         columns.append(Column("cost", lambda step: f"{step.cost:g}"))
     columns.append(Column("sites", lambda step: ", ".join(step.sites), "left", wrap=True))
-    return make_table(columns, placed.curve)
+    return make_table(columns, steps)
 
 
 def _together_head(by: ScoreLabel) -> str:
@@ -271,9 +275,6 @@ def describe_plan(placed: SensorPlan) -> str:
     sites = ", ".join(sensor.site for sensor in placed.sensors) or "no sensor"
     cost = f" for {last.cost:g}" if last.cost else ""
     score = by.says.format(by.with_unit(last.score, last.score_se))
-    if placed.joint_of_all > 0:
-        share = placed.share_of_all(last.score)
-        score += f", {format_percent(share)} of what all {placed.candidates} candidates reach together"
     return f"The plan {sites}{cost} {score}; {_describe_proof(placed)}."
 
 
@@ -284,7 +285,7 @@ def describe_errors(placed: SensorPlan) -> str:
     if placed.has_errors:
         text = f"± is one standard error, from {placed.errors_from}"
         if placed.by.name == DEFAULT_SCORE:
-            text += "; it is without the error of the level, which was measured for single sensors only"
+            text += ", without the error of the level"
         return text
     return f"no standard errors: {placed.errors_from}"
 
@@ -297,9 +298,7 @@ def describe_absent_best(placed: SensorPlan) -> str | None:
     (best,) = first.sites
     if best in {sensor.site for sensor in placed.sensors}:
         return None
-    return (
-        f"The best single site, {best}, is not part of this plan: the sites of the plan complement one another better."
-    )
+    return f"The best single site, {best}, is not part of this plan: its sites complement one another better."
 
 
 def _describe_proof(placed: SensorPlan) -> str:

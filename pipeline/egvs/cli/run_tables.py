@@ -34,6 +34,7 @@ from egvs.results.levels import GROUPS_NOTE, DetectionLevel, GroupLevel, read_le
 from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pole
 from egvs.scenario.score_config import ALL_DETECTORS, DEFAULT_SCORE, NOTICED
 from egvs.sensors.return_model import NEGLIGIBLE_LOSS, ReturnModel
+from egvs.sensors.sensor import FEW_BEAMS, FEW_BEAMS_HINT, describe_few_beams
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from egvs.sensors.beam_files import BeamFile
     from egvs.sensors.sensor import Sensor
     from egvs.stages.check import CheckReport
+    from egvs.stages.scene_checks import PoleSurroundings
     from egvs.studies.effect_study import EffectChange, EffectCost, EffectStatus
 
 _RESULT_FILE_WIDTH = 150
@@ -297,9 +299,27 @@ def print_verification(folder: Path, differences: list[str]) -> None:
         out.print(f"{folder}: all artefacts are unaltered, and a second run reproduces them byte for byte")
 
 
-def print_check(checked: CheckReport) -> None:
-    """Print all findings of a check: errors first, grouped by rule."""
+MAX_POLES = 30
+"""Poles that ``egvs check`` lists unless all details are printed."""
+
+
+def print_check(checked: CheckReport, *, with_details: bool = False) -> None:
+    """Print where the poles stand, and all findings of a check: errors first, grouped by rule."""
     out = console(_RESULT_FILE_WIDTH)
+    if checked.poles:
+        columns: list[Column[PoleSurroundings]] = [
+            Column("pole", lambda pole: pole.pole, "left"),
+            Column("x m", lambda pole: f"{pole.x_m:.1f}"),
+            Column("y m", lambda pole: f"{pole.y_m:.1f}"),
+            Column("kerb m", lambda pole: _format_distance(pole.kerb_m)),
+            Column("wall m", lambda pole: _format_distance(pole.wall_m)),
+            Column("stands", lambda pole: pole.where or "-", "left", wrap=True),
+        ]
+        shown = checked.poles if with_details else checked.poles[:MAX_POLES]
+        print_table(columns, shown, file_width=_RESULT_FILE_WIDTH)
+        if hidden := len(checked.poles) - len(shown):
+            out.print(f"{hidden} more poles; --verbose lists them")
+        out.print("kerb: distance to the edge of the carriageway; wall: to the nearest building or other surface")
     for severity, findings in (("error", checked.errors), ("warning", checked.warnings)):
         if not findings:
             continue
@@ -313,6 +333,10 @@ def print_check(checked: CheckReport) -> None:
     if not checked.findings:
         out.print("no errors or warnings")
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
+
+
+def _format_distance(distance_m: float) -> str:
+    return format_or_dash(None if math.isnan(distance_m) else distance_m, ".1f")
 
 
 def print_protections(missing: Sequence[str]) -> None:
@@ -402,13 +426,16 @@ def print_sensor_details(sensors: Iterable[Sensor]) -> None:
             )
         if sensor.assumed:
             lines.append(f"  assumed: {sensor.assumed}")
+        few = describe_few_beams(sensor)
+        if few is not None:
+            lines.append(f"  warning: {few}. {FEW_BEAMS_HINT}")
         print_sentences(lines)
 
 
 def print_beam_file(path: Path, file: BeamFile) -> None:
     """Print what was read of a file of beams, and how a scenario uses it."""
     from egvs.sensors.beam_files import BeamTable
-    from egvs.sensors.sensor import FEW_BEAMS, FEW_BEAMS_HINT, describe_odd_angles
+    from egvs.sensors.sensor import describe_odd_angles
 
     beams = file.beams
     if isinstance(beams, BeamTable):

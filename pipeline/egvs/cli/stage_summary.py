@@ -111,7 +111,7 @@ def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[
     sites, solids, lanes = rest.pop("sites"), summary["solids"], rest.pop("lanes")
     yield Sentence(f"{number_of(sites, 'site')}, {number_of(solids, 'solid')} and {number_of(lanes, 'lane')} checked")
     for note in rest.pop("losses", ()):
-        yield Sentence(note)
+        yield _detail(note)
 
 
 def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
@@ -155,7 +155,7 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_sourc
     if tracks := rest.pop("tracks", None):
         yield from _track_sentences(tracks)
     if sizes := rest.pop("sizes", None):
-        yield Sentence(describe_sizes(sizes))
+        yield _detail(describe_sizes(sizes))
     if sumo := rest.pop("sumo", None):
         yield _detail(f"SUMO {sumo}")
 

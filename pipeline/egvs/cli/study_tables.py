@@ -1,13 +1,13 @@
 """What ``egvs compare`` prints: runs, poles, sensors, assumed heights, and settings side by side.
 
-Runs in columns and poles or sites in rows, the agreement of their rankings, the best mount of each sensor and what one
-more percentage point costs, and the differences of settings.
+Runs in columns and poles or sites in rows, the agreement of their rankings, the best mount of each sensor, and the
+differences of settings.
 """
 
 from __future__ import annotations
 
 import json
-import shlex
+import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -15,15 +15,23 @@ from typing import TYPE_CHECKING, Literal
 from rich.console import Console
 from rich.table import Table
 
-from egvs.artefacts.readers import DISTINCT_PROBABILITY
-from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table, percent_or_dash, print_sentences
-from egvs.core.wording import format_percent, list_first
+from egvs.cli.console import (
+    LINE_WIDTH,
+    NARROW,
+    Column,
+    console,
+    format_or_dash,
+    make_table,
+    percent_or_dash,
+    print_sentences,
+)
+from egvs.core.wording import list_first, number_of
 from egvs.report.sensor_text import (
     costs_option,
-    describe_evidence,
-    describe_losses,
     describe_order,
+    describe_trust,
     explain_differences,
+    explain_sensor_differences,
     noticed_preference,
     range_note,
 )
@@ -33,7 +41,6 @@ from egvs.results.sensors import (
     ScoreDifference,
     SensorComparison,
     SensorResult,
-    difference_unit,
     format_difference,
 )
 from egvs.scenario.score_config import NOTICED
@@ -43,14 +50,18 @@ if TYPE_CHECKING:
     from egvs.studies.assumed_heights import HeightRuns, HeightSensitivity, RankedAgain
     from egvs.studies.run_comparison import ComparedPole, ComparedRun, Comparison, Difference, RankAgreement
 
-_FILE_WIDTH = 190
+_FILE_WIDTH = LINE_WIDTH
+_MIN_RANKED = 5
+"""With fewer common poles or sites, rank correlations say nothing, and are not printed."""
+DEFAULT_ROWS = 5
+"""Poles or sites that are listed, unless another number is asked for."""
 _ALL_PAIRS_RUNS = 5
 """With more runs, the agreement of rankings is printed for pairs with the first run only."""
 _COLUMN_GAP = 2
 """Space that rich leaves between two columns."""
 
 
-def print_comparison(comparison: Comparison, top: int | None = None, command: Sequence[str] = ()) -> None:
+def print_comparison(comparison: Comparison, top: int | None = None) -> None:
     """Print runs side by side.
 
     Parameters
@@ -58,23 +69,25 @@ def print_comparison(comparison: Comparison, top: int | None = None, command: Se
     comparison
         The runs.
     top
-        How many poles or sites of the first run are printed; all for None.
-    command
-        Words of the command that compares these runs; by default ``egvs compare`` with their folders.
+        How many poles or sites of the first run are printed; the best :data:`DEFAULT_ROWS` for None.
     """
+    top = top or DEFAULT_ROWS
     out = console(_FILE_WIDTH, soft_wrap=False)
     for run in comparison.runs:
         out.print(f"{run.label}  {run.folder}  ({join_names(run.sensors)})", soft_wrap=True)
     out.print()
     for table in _result_tables(comparison, top, out.width):
         out.print(table)
-        out.print()
+    rows = len(comparison.poles if comparison.by == "pole" else comparison.sites)
+    if rows > top:
+        out.print(f"{number_of(rows - top, f'more {comparison.by}')}: --top {rows} lists all")
+    out.print()
     if comparison.by == "pole":
-        _print_pole_notes(out, comparison, top)
+        _print_pole_notes(out, comparison)
     out.print(_agreement_table(comparison))
     out.print()
     if comparison.sensors is not None:
-        _print_sensors(out, comparison, comparison.sensors, command)
+        _print_sensors(out, comparison, comparison.sensors)
     if comparison.differences:
         _print_differences(out, comparison)
     elif len({run.folder for run in comparison.runs}) > 1:
@@ -144,15 +157,23 @@ def _result_table(comparison: Comparison, runs: Sequence[int], top: int | None, 
 def _pole_columns(comparison: Comparison, runs: Sequence[int], width: int) -> list[Column[ComparedPole]]:
     """Return the best mount of each pole in some runs, and the differences from the first run."""
     columns: list[Column[ComparedPole]] = [Column("pole", lambda pole: pole.name, "left", wrap=True)]
+    has_same_mounts = width < NARROW and all(_is_same_mount(pole) for pole in comparison.poles)
     for run in runs:
-        columns += _mount_columns(comparison, run, width)
+        columns += _mount_columns(comparison, run, width, with_mount=run == 0 or not has_same_mounts)
         if run > 0 and any(pole.differences[run] is not None for pole in comparison.poles):
             title = f"{comparison.runs[run].label} - {comparison.runs[0].label}"
             columns.append(Column(title, partial(_format_gap, run)))
     return columns
 
 
-def _mount_columns(comparison: Comparison, run: int, width: int) -> list[Column[ComparedPole]]:
+def _is_same_mount(pole: ComparedPole) -> bool:
+    """Whether the best mounts of a pole have the same height and tilt in all runs."""
+    return len({None if mount is None else (mount.z_m, mount.pitch_deg) for mount in pole.mounts}) == 1
+
+
+def _mount_columns(
+    comparison: Comparison, run: int, width: int, *, with_mount: bool = True
+) -> list[Column[ComparedPole]]:
     """Return the columns of one run, without those that are the same at all its sites."""
     compared = comparison.runs[run]
     sites = compared.ranking.sites
@@ -168,7 +189,8 @@ def _mount_columns(comparison: Comparison, run: int, width: int) -> list[Column[
 
     is_pitched = any(site.pitch_deg for site in sites)
     if width < NARROW:
-        column("mount", partial(_describe_mount, is_pitched), "left")
+        if with_mount:
+            column("mount", partial(_describe_mount, is_pitched), "left")
     elif any(mount is not None and mount.site != name for mount, name in names):
         column("best site", lambda site: site.site, "left")
     if len(compared.sensors) > 1:
@@ -189,7 +211,9 @@ def _describe_mount(with_pitch: bool, site: RankedSite) -> str:
 
 
 def format_score(site: RankedSite) -> str:
-    """Return the score that ranks with its standard error, e.g. "87.1 % ± 0.5 %"."""
+    """Return the score that ranks with its standard error, e.g. "87.1 ± 0.5 %"; that of other scores is relative."""
+    if site.by.is_share:
+        return site.by.with_error(site.score, math.nan if site.score_se is None else site.score_se)
     error = site.by.error(site.score, site.score_se)
     if error == "-":
         return site.by.value(site.score)
@@ -203,10 +227,8 @@ def _format_gap(run: int, pole: ComparedPole) -> str:
     return format_difference(difference, mount)
 
 
-def _print_pole_notes(out: Console, comparison: Comparison, top: int | None) -> None:
+def _print_pole_notes(out: Console, comparison: Comparison) -> None:
     """Explain the table of poles, and say at how many poles another run is better."""
-    if top is not None and len(comparison.poles) > top:
-        out.print(f"{len(comparison.poles) - top} more: without --top, all are listed")
     first = comparison.runs[0]
     compared = [run for run in range(1, len(comparison.runs)) if _gaps(comparison, run)]
     sentences = []
@@ -214,16 +236,11 @@ def _print_pole_notes(out: Console, comparison: Comparison, top: int | None) -> 
         gaps = _gaps(comparison, run)
         better = [gap.is_clear for gap in gaps if gap.value > 0]
         worse = [gap.is_clear for gap in gaps if gap.value < 0]
-        sentences.append(
-            f"{comparison.runs[run].label} against {first.label} at {len(gaps)} common poles: better at {len(better)} "
-            f"(clearly at {sum(better)}), worse at {len(worse)} (clearly at {sum(worse)})"
-        )
-    if compared:
-        sentences.append(
-            f"differences of the best mounts from {first.label} are in {difference_unit(first.ranking.best[0])}, ± "
-            "their standard error; ~ it is not clear which is better (probability below "
-            f"{format_percent(DISTINCT_PROBABILITY, 0)})"
-        )
+        label = comparison.runs[run].label
+        text = f"{label} is better than {first.label} at {len(better)} of {len(gaps)} poles (clearly at {sum(better)})"
+        sentences.append(f"{text}, worse at {len(worse)} (clearly at {sum(worse)}).")
+    if compared and comparison.sensors is None:
+        sentences.append(explain_differences(first.label, first.ranking.best[0]))
     print_sentences(sentences)
     out.print()
 
@@ -236,7 +253,7 @@ def _gaps(comparison: Comparison, run: int) -> list[ScoreDifference]:
 # ---- sensors
 
 
-def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparison, command: Sequence[str]) -> None:
+def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparison) -> None:
     """Print the best mount of each sensor, what it costs, and how far the comparison can be trusted."""
     by = sensors.baseline.site.by
     columns: list[Column[SensorResult]] = []
@@ -256,23 +273,17 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
     columns.append(Column(f"difference\nfrom {sensors.baseline_name}", lambda result: result.gain_text))
     if any(result.mount.cost is not None for result in sensors.results):
         columns.append(Column("cost", lambda result: result.cost_text))
-    if sensors.shows_cost_per_point:
-        columns.append(Column("one more point costs", lambda result: result.cost_per_point_text, wrap=True))
-    if sensors.shows_cost_per_point and sensors.has_steps:
-        columns.append(Column("… from the best cheaper sensor", lambda result: result.step_cost_text, wrap=True))
     out.print(make_table(columns, sensors.results, width=out.width, title="the best mount of each sensor"))
-    print_sentences([explain_differences(sensors)])
+    print_sentences([explain_sensor_differences(sensors)])
     if preference := noticed_preference(sensors):
         print_sentences([preference])
     if sensors.unpriced:
-        words = command or ["egvs", "compare", *dict.fromkeys(str(run.folder) for run in comparison.runs)]
         option = costs_option(sensors.sensors if not sensors.has_costs else sensors.unpriced)
-        hint = f"What one more point costs: {shlex.join(words)} {option}, or [costs] in scenario.toml"
-        out.print(hint, soft_wrap=True)  # a command that is broken into lines cannot be copied
+        out.print(f"With costs: {option}, or [costs] in scenario.toml", soft_wrap=True)  # to be copied
     is_modelled = all(run.has_losses for run in comparison.runs)
     if note := range_note(sensors.sensors, is_modelled=is_modelled):
         print_sentences([note])
-    print_sentences([describe_evidence(sensors), describe_losses(has_interval=sensors.has_loss_interval)])
+    print_sentences([describe_trust(sensors)])
     if order := describe_order(sensors):
         print_sentences([order])
     out.print()
@@ -332,8 +343,11 @@ def _agreement_table(comparison: Comparison) -> Table:
     columns: list[Column[RankAgreement]] = [
         Column("runs", lambda pair: f"{pair.a}, {pair.b}", "left"),
         Column(f"common {comparison.by}s", lambda pair: str(pair.shared), wrap=True),
-        Column("tau", lambda pair: format_or_dash(pair.tau, ".2f")),
-        Column("rho", lambda pair: format_or_dash(pair.rho, ".2f")),
+    ]
+    if any(pair.shared >= _MIN_RANKED for pair in comparison.agreements):
+        columns.append(Column("tau", lambda pair: _format_correlation(pair, pair.tau)))
+        columns.append(Column("rho", lambda pair: _format_correlation(pair, pair.rho)))
+    columns += [
         Column("best", _format_best_sites, "left", wrap=True),
         Column("regret of the first run's best", lambda pair: percent_or_dash(pair.regret_a, 2), wrap=True),
     ]
@@ -342,6 +356,10 @@ def _agreement_table(comparison: Comparison) -> Table:
     if len(comparison.runs) <= _ALL_PAIRS_RUNS:
         return make_table(columns, comparison.agreements)
     return make_table(columns, with_first, caption=f"only pairs with {first}; compare fewer runs for the others")
+
+
+def _format_correlation(pair: RankAgreement, value: float | None) -> str:
+    return format_or_dash(value if pair.shared >= _MIN_RANKED else None, ".2f")
 
 
 def _format_best_sites(pair: RankAgreement) -> str:

@@ -175,6 +175,7 @@ _PAGE_RULES = """
 .plan .share.day { opacity: .88; }
 .plan .worst circle { fill: var(--halo); stroke: currentColor; stroke-width: 1.4; }
 .plan .worst text { font-weight: 700; font-size: 11px; text-anchor: middle; }
+.plan .view { fill: #3d85c6; fill-opacity: .08; stroke: #3d85c6; stroke-width: 1.4; stroke-linejoin: round; }
 .plan .planned rect { fill: #2b6cb0; stroke: var(--halo); stroke-width: 1.6; }
 .plan .planned text { fill: #ffffff; font-weight: 700; font-size: 11.5px; text-anchor: middle; }
 .plan .step rect { fill: #31688e; } .plan .step path { stroke: currentColor; stroke-width: 2.4; fill: none; }

@@ -250,12 +250,8 @@ def missed_view(
     A page can replace the image, which has the class ``share``; unused numbers are hidden. See :func:`site_view` for
     the parameters.
     """
-    plan, image = site_view_frame(box, prefix), colours.share_image(blindspots.share_missed)
-    (x, y), (nx, ny), cell_m = blindspots.origin_m, blindspots.share_missed.shape, blindspots.cell_m
-    rectangle = (plan.x(x), plan.y(y + ny * cell_m), nx * cell_m * plan.scale, ny * cell_m * plan.scale)
-    parts = [road_paths(plan, backdrop.roads)]
-    for theme in colours.THEMES:
-        parts.append(plan.image(rectangle, image.uri(colours.SHARE_PALETTES[theme]), f"field share {theme}"))
+    plan = site_view_frame(box, prefix)
+    parts = [road_paths(plan, backdrop.roads), *_share_images(plan, blindspots)]
     parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid), _sensor_mark(plan, site.x_m, site.y_m)]
     for number, position in enumerate(label_positions(plan, blindspots), start=1):
         transform = 'display="none"'
@@ -623,20 +619,43 @@ class PlannedPole:
         return 10.0 + 3.4 * max(0, len(self.numbers) - 1)
 
 
-def plan_map(
+def answer_map(
     grid: Grid,
-    values: ColumnValues,
     backdrop: Backdrop,
     candidates: Sequence[RankedSite],
     poles: Sequence[PlannedPole],
+    views_m: Sequence[NDArray[np.float64]],
+    missed: SiteBlindspots | None,
     alt: str,
 ) -> str:
-    """Return a map of the poles of a plan, numbered in their order, over all candidates; traffic faint below.
+    """Return the junction from above with the chosen poles, their fields of view, and where vehicles are not found.
 
-    See :func:`occupancy` for the parameters.
+    Parameters
+    ----------
+    grid
+        The voxel grid of the region.
+    backdrop
+        Roads and outlines.
+    candidates
+        All sites, small circles.
+    poles
+        The chosen poles, numbered in their order.
+    views_m
+        Outlines of fields of view in the world frame, (n, 2) each.
+    missed
+        The share of the vehicles over each cell that the chosen sensors miss; None if it is unknown.
+    alt
+        Text for people who do not see the figure.
     """
-    plan = MapFrame(extent(grid, candidates), "plan", north=True)
-    parts = base_layers(plan, grid, values, backdrop)
+    box = extent(grid, [])
+    plan = MapFrame(box, "answer", width=640.0, tallest=560.0, north=True)
+    parts = [road_paths(plan, backdrop.roads)]
+    bar = None
+    if missed is not None:
+        parts += _share_images(plan, missed)
+        bar = ColourBar(0.0, 100.0, "Share of vehicles not found (%)", even=True)
+    parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid)]
+    parts += [f'<path class="view" d="{_closed_path(plan, view_m)}"/>' for view_m in views_m if len(view_m) > 2]
     for x_m, y_m in dict.fromkeys((site.x_m, site.y_m) for site in candidates):
         parts.append(f'<circle class="spot" cx="{plan.x(x_m):.1f}" cy="{plan.y(y_m):.1f}" r="3"/>')
     spots = []
@@ -646,4 +665,13 @@ def plan_map(
         number = f'<text x="{x:.1f}" y="{y + 4:.1f}">{escape(pole.numbers)}</text>'
         parts.append(f'<g class="planned"><title>{escape(pole.title)}</title>{shape}{number}</g>')
         spots.append(LabelSpot(x, y, pole.label, half))
-    return plan.svg([*parts, *labels(plan, spots, _outline_boxes(plan.region(grid)))], alt)
+    return plan.svg([*parts, *labels(plan, spots, _outline_boxes(plan.region(grid)))], alt, bar)
+
+
+def _share_images(plan: MapFrame, blindspots: SiteBlindspots) -> Iterator[str]:
+    """Yield the share of vehicles that are missed in each cell, as an image for each theme."""
+    image = colours.share_image(blindspots.share_missed)
+    (x, y), (nx, ny), cell_m = blindspots.origin_m, blindspots.share_missed.shape, blindspots.cell_m
+    rectangle = (plan.x(x), plan.y(y + ny * cell_m), nx * cell_m * plan.scale, ny * cell_m * plan.scale)
+    for theme in colours.THEMES:
+        yield plan.image(rectangle, image.uri(colours.SHARE_PALETTES[theme]), f"field share {theme}")

@@ -244,6 +244,27 @@ def _hit_positions_m(beams: Beams) -> NDArray[np.float64]:
     return ends
 
 
+_VIEW_STEP_DEG = 2
+"""Width of the sectors of a field of view."""
+
+
+def view_outline_m(beams: Beams) -> NDArray[np.float64]:
+    """Return the field of view of a sensor from above, in the world frame, (n, 2).
+
+    In each sector of azimuths it reaches as far as the farthest beam that points down: to the ground, to the first
+    object, or to the range of the sensor. Sectors without such beams are at the sensor.
+    """
+    down_m = beams.ends_m[beams.ends_m[:, 2] < 0.0, :2]
+    azimuth_deg = np.degrees(np.arctan2(down_m[:, 1], down_m[:, 0])) % 360.0
+    sector = (azimuth_deg // _VIEW_STEP_DEG).astype(np.int64)
+    reach_m = np.zeros(360 // _VIEW_STEP_DEG)
+    np.maximum.at(reach_m, np.minimum(sector, len(reach_m) - 1), np.hypot(down_m[:, 0], down_m[:, 1]))
+    middle_rad = np.radians((np.arange(len(reach_m)) + 0.5) * _VIEW_STEP_DEG)
+    outward = np.column_stack((np.cos(middle_rad), np.sin(middle_rad)))
+    outline_m: NDArray[np.float64] = outward * reach_m[:, None] + np.asarray(beams.pose.position_m[:2])
+    return outline_m
+
+
 def column_entropy(field: EntropyField, which: NDArray[np.bool_]) -> ColumnValues:
     """Return the entropy of some of the uncertain voxels, summed along z.
 

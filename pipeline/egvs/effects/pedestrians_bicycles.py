@@ -102,7 +102,7 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
     def summary(self, scene: Scene) -> str:
         """Return where people could walk, as a sentence."""
         path = sumo_folder.network_path(scene.scenario)
-        if path is None or network.is_osm(path) or scene.scenario.traffic.is_finished:
+        if path is None or scene.scenario.traffic.is_finished:
             return ""
         walkways = network.read_net_xml(path).walkways
         if not walkways.sidewalks or not walkways.areas:

@@ -359,7 +359,8 @@ class CoordinateReading:
         """Convert coordinates (n, 2) to world-frame x, y in metres, (n, 2) float64; InputError where undefined."""
         if self.convert is None:
             return xy
-        xy_m = np.round(self.convert(xy), _DIGITS_M) + 0.0  # no -0
+        with np.errstate(over="ignore"):  # infinite ones are rejected below
+            xy_m = np.round(self.convert(xy), _DIGITS_M) + 0.0  # no -0
         for i in np.flatnonzero(~np.isfinite(xy_m).all(axis=1)):
             problem = f"({xy[i, 0]:.10g}, {xy[i, 1]:.10g}) cannot be converted from {self.description}"
             raise InputError(self.where, problem, "Check the coordinates and the scenario's projection.")

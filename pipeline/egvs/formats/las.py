@@ -13,6 +13,7 @@ A file may declare its coordinate reference system (:func:`crs_of`), as WKT or a
 
 from __future__ import annotations
 
+import io
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
@@ -228,9 +229,10 @@ def _projection_records(file: BinaryIO, head: bytes) -> dict[int, bytes]:
     records: dict[int, bytes] = {}
     for table in tables:
         at = table.start
+        end = file.seek(0, io.SEEK_END)
         size = struct.calcsize(table.head)
         for _ in range(min(table.number, _MAX_RECORDS)):
-            file.seek(min(at, 1 << 62))
+            file.seek(min(at, end))
             start_of_record = file.read(size)
             if len(start_of_record) < size:
                 break

@@ -8,7 +8,7 @@ and columns without any value are skipped, as spreadsheets keep those that were 
 rejected; so is one with decimal commas where each cell with a point could be (``1.500``).
 
 Workbooks (xlsx, xls, ods) are read by :mod:`egvs.formats.workbooks`. Of several sheets, one must have the expected
-header.
+header. A cell with the error of a formula (``#REF!``) is an error in any column.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ _SEPARATOR_LINE = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
 _COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?")
 _THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}[,.][0-9]{3}")
 _POINT_NUMBER = re.compile(r"[+-]?[0-9]+\.[0-9]+([eE][+-]?[0-9]+)?")
+_FORMULA_ERROR = re.compile(rf"#[^\W\d][\w/]*[!?]|#N/A|#NV|Err:5[0-9]{{2}}|{workbooks.NO_VALUE}")
 _MARKUP = re.compile(r"\s*<(?:[!?]|html|table)", re.IGNORECASE)
 _SAVE_HINT = "Save it as CSV in UTF-8."
 _MAX_NAMED = 5
@@ -118,8 +119,21 @@ def read_rows(path: Path, check_header: CheckHeader) -> TableRows:
         if header.count(name) > 1:
             raise InputError(f"{table.where}: header", f"two columns are called {name!r}", "Rename or remove one.")
     _use_decimal_points(table)
-    rows = [(table.locate(number), dict(zip(header, cells, strict=True))) for number, cells in table.rows]
-    return TableRows(rows, table.errors)
+    rows, errors = [], list(table.errors)
+    for number, cells in table.rows:
+        where = table.locate(number)
+        row = dict(zip(header, cells, strict=True))
+        failed = [name for name in row if _FORMULA_ERROR.fullmatch(row[name])]
+        errors += [_formula_error(f"{where}: {name}", row[name]) for name in failed]
+        if not failed:
+            rows.append((where, row))
+    return TableRows(rows, errors)
+
+
+def _formula_error(where: str, text: str) -> InputError:
+    if text == workbooks.NO_VALUE:
+        return InputError(where, text, "Open the table in a spreadsheet program, and save it.")
+    return InputError(where, f"expected a value, got the formula error {text}", "Correct the formula.")
 
 
 # ---- cells

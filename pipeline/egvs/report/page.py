@@ -11,12 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egvs.artefacts.readers import DISTINCT_PROBABILITY, MIN_VEHICLES, PeriodRanking
+import numpy as np
+
+from egvs.artefacts.readers import DISTINCT_PROBABILITY, MIN_VEHICLES, PeriodRanking, read_blindspots
 from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord, traffic_summary
 from egvs.artefacts.tpog import Tpog, read_tpog
@@ -43,8 +45,9 @@ from egvs.report.ranking_text import (
     noticed_preference,
     ranking_disagreement,
     recorded_frames_hint,
+    short_lead,
 )
-from egvs.report.reliability import describe_reliability
+from egvs.report.reliability import by_severity, describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
     assumes_flows,
@@ -52,17 +55,26 @@ from egvs.report.sections import (
     busiest_counts,
     describe_counts,
     describe_poles_on_road,
+    main_assumptions,
     study_values,
 )
-from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, has_losses, range_note
+from egvs.report.sensor_text import (
+    LOSSES_EVIDENCE,
+    costs_option,
+    describe_evidence,
+    explain_sensor_differences,
+    has_losses,
+    range_note,
+)
 from egvs.results import labels as formatting
 from egvs.results.labels import SCORE_LABELS
 from egvs.results.levels import GROUPS_NOTE, DetectionLevel, GroupLevel, read_levels
 from egvs.results.map_credits import read_map_credits
-from egvs.results.ranking import RankedSite, Ranking, share_of_limit
+from egvs.results.ranking import RankedSite, Ranking, share_of_limit, site_titles
 from egvs.results.sensors import SensorComparison
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import NOTICED
+from egvs.sensors.sites import Site, has_relief
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_dependencies import scan_dependencies
 
@@ -133,6 +145,10 @@ class PageContents:
         SVG with the names and counts of the approaches; empty without counts.
     sections
         Sections of extensions.
+    titles
+        What people call the sites, by their names.
+    answer_map
+        SVG of the best site or the plan; empty without a map.
     """
 
     scenario: Scenario
@@ -151,6 +167,8 @@ class PageContents:
     approaches: tuple[ApproachFit, ...] = ()
     approach_map: str = ""
     sections: tuple[SectionContents, ...] = ()
+    titles: Mapping[str, str] = field(default_factory=dict)
+    answer_map: str = ""
 
 
 @dataclass(frozen=True)
@@ -214,6 +232,8 @@ def dependencies(work: StageContext) -> StageDependencies:
     costs = {name: [stage.cost.seconds, stage.cost.peak_mb] for name, stage in stages.items()}
     warnings = [stage.summary.get(WARNINGS_KEY, []) for stage in stages.values()]
     more = {"costs": costs, "summaries": summaries, "warnings": warnings}
+    if "check" in stages:
+        more["losses"] = stages["check"].summary.get("losses", [])
     more["sections"] = section_dependencies(work.folder, scenario, stages)
     return StageDependencies(settings, hashes, more, section_modules())
 
@@ -274,6 +294,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
 
     network, backdrop, best = network_file(out), drawn.backdrop, ranking.sites[0]
     plan = _read_plan(work.folder, stages)
+    titles = site_titles(ranking.sites, has_relief=has_relief(work.scenario))
     mapped = [pole.best for pole in ranking.poles[:MAPPED_POLES]]
     mounts = [] if plan is None else [sensor.mount for sensor in plan.sensors]
     moved = plan is not None and plan.refinement is not None
@@ -290,7 +311,9 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         stages,
         study=study_values(work.folder, stages),
         by_period=PeriodRanking.read(out),
-        plan=None if plan is None else _plan_values(plan, ranking, tpog, drawn),
+        plan=None if plan is None else _plan_values(plan, titles),
+        titles=titles,
+        answer_map=_draw_answer(work, plan, ranking, tpog, backdrop),
         what_if=_read_what_ifs(work, stages, best),
         movements=describe_counts(work.scenario, network),
         levels=read_levels(work.folder.levels, ranking.sites[0].site),
@@ -326,10 +349,38 @@ def _read_plan(folder: RunFolder, stages: Mapping[str, StageRecord]) -> SensorPl
     return plan if plan is not None and plan.belongs_to(stages) else None
 
 
-def _plan_values(plan: SensorPlan, ranking: Ranking, tpog: Tpog, drawn: Figures) -> dict[str, Any]:
-    from egvs.report.plan_section import plan_values
+def _plan_values(plan: SensorPlan, titles: Mapping[str, str]) -> dict[str, Any]:
+    from egvs.report.plan_section import plan_headline, plan_values
 
-    return plan_values(plan, ranking.sites, tpog, drawn.backdrop)
+    headline = plan_headline(plan, titles) if plan.sensors else ""
+    return {**plan_values(plan), "plan_headline": headline}
+
+
+def _draw_answer(
+    work: StageContext, plan: SensorPlan | None, ranking: Ranking, tpog: Tpog, backdrop: maps.Backdrop
+) -> str:
+    """Return the map of the plan, or of the best site without one, SVG text; empty where no site is best."""
+    from egvs.stages.plan_scans import plan_beams
+
+    best = ranking.best[0]
+    if not best.score > 0:
+        return ""
+    poles = [maps.PlannedPole(best.x_m, best.y_m, "1", best.pole, best.site)]
+    sites, moved = [Site(best.site, best.pose, best.sensor)], False
+    if plan is not None and plan.sensors:
+        from egvs.report.plan_section import planned_poles
+
+        poles = planned_poles(plan)
+        sites, moved = [sensor.mount for sensor in plan.sensors], plan.refinement is not None
+    views_m = [figures.view_outline_m(beams) for _, beams in plan_beams(work, sites, moved=moved)]
+    missed = None
+    if work.scenario.score.blindspots:
+        of_sites = list(read_blindspots(work.folder.blindspots, {site.name for site in sites}))
+        together = np.prod([spots.share_missed for spots in of_sites], axis=0)
+        missed = replace(of_sites[0], share_missed=together)
+    names = ", ".join(pole.label for pole in poles)
+    alt = f"The junction from above: {names}, the fields of view, and the share of vehicles that are not found."
+    return maps.answer_map(tpog.grid, backdrop, ranking.sites, poles, views_m, missed, alt)
 
 
 def _read_what_ifs(work: StageContext, stages: Mapping[str, StageRecord], best: RankedSite) -> WhatIfSection | None:
@@ -377,6 +428,7 @@ def render_page(contents: PageContents) -> str:
     values = {
         **vars(contents),
         **contents.study,
+        "plan_headline": "",
         **(contents.plan or {}),
         **_ranking_values(contents.ranking),
         "found_level": _found_level(contents, contents.scenario.score.detectors),
@@ -465,15 +517,17 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
 
 def _sensor_values(contents: PageContents) -> dict[str, Any]:
     """The best mount of each sensor; None where there is one sensor."""
-    sensors = SensorComparison.of_run(contents.ranking.sites, contents.scenario.costs)
+    sensors = SensorComparison.of_run(
+        contents.ranking.sites, contents.scenario.costs, contents.scenario.sites.existing_poles
+    )
     names = [site.sensor for site in contents.ranking.sites]
     return {
         "sensors": sensors,
         "range_note": range_note(names, is_modelled=has_losses(contents.scenario, names)),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
-        "sensors_explanation": explain_differences(sensors) if sensors is not None else "",
+        "sensors_explanation": explain_sensor_differences(sensors) if sensors is not None else "",
         "sensors_preference": sensor_text.noticed_preference(sensors) if sensors is not None else "",
-        "sensors_evidence": describe_evidence(sensors) if sensors is not None else "",
+        "sensors_evidence": f"{describe_evidence(sensors)} {LOSSES_EVIDENCE}" if sensors is not None else "",
     }
 
 
@@ -497,8 +551,10 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
         sensors = [site.sensor for site in contents.ranking.sites]
         if note := sensor_text.upper_limit_note(contents.scenario, sensors):
             reliability.append(note)
+    assumed = assumptions(contents.scenario, traffic_summary(contents.stages).get("signals", ()))
     return {
-        "warnings": warnings,
+        "warnings": by_severity(warnings),
+        "main_assumptions": main_assumptions(assumed),
         "reliability": reliability,
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
@@ -511,7 +567,8 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     setting = egvs_setting(scenario.gamma, tpog.grid.voxel_m, moving_occlusion=has_occlusion)
     found = _found_level(contents, scenario.score.ranking_detectors)
     return {
-        "headline": headline(ranking, bool(tpog.counts.any()), found),
+        "headline": headline(ranking, bool(tpog.counts.any()), found, contents.titles),
+        "short_lead": short_lead(ranking),
         "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
         "preference": noticed_preference(ranking),

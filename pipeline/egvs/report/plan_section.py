@@ -1,41 +1,30 @@
-"""The section of the page on the plan of ``egvs place``: its proof, a map, and the score for each number of sensors."""
+"""What the page says of the plan of ``egvs place``: headline, proof, and the score for each number of sensors."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 
-from egvs.artefacts.tpog import Tpog
-from egvs.core.wording import format_percent
-from egvs.drawing import maps, svg_figures
-from egvs.drawing.maps import Backdrop, PlannedPole
+from egvs.core.wording import number_of
+from egvs.drawing import svg_figures
+from egvs.drawing.maps import PlannedPole
 from egvs.drawing.svg_figures import CurveStep
 from egvs.report import plan_answer
+from egvs.results.labels import join_names
 from egvs.results.plans import PlannedSensor, SensorPlan
-from egvs.results.ranking import RankedSite
+
+_MAX_NAMED = 3
+"""With more sensors, a headline names their poles only."""
 
 
-def plan_values(
-    plan: SensorPlan, candidates: Sequence[RankedSite], tpog: Tpog, backdrop: Backdrop
-) -> dict[str, SensorPlan | str]:
-    """Return what the page shows of a plan, by the names of the template: the plan, sentences, and figures (SVG text).
-
-    Parameters
-    ----------
-    plan
-        The plan.
-    candidates, tpog, backdrop
-        Contents of the map.
-    """
-    occupied = tpog.counts.sum(axis=2) / tpog.frames
-    alt = f"Map of the plan: {', '.join(sensor.site for sensor in plan.sensors)}."
+def plan_values(plan: SensorPlan) -> dict[str, SensorPlan | str]:
+    """Return what the page shows of a plan, by the names of the template: the plan, sentences, a chart (SVG text)."""
     return {
         "plan": plan,
         "plan_proof": _describe_proof(plan),
         "plan_objective": plan_answer.describe_objective(plan.request),
         "plan_answer": plan_answer.describe_plan_count(plan),
         "plan_assumption": plan_answer.describe_joint_score(plan.by, len(plan.sensors)),
-        "plan_map": maps.plan_map(tpog.grid, occupied, backdrop, candidates, _planned_poles(plan), alt),
         "plan_chart": _curve_chart(plan),
     }
 
@@ -64,25 +53,35 @@ def _describe_proof(plan: SensorPlan) -> str:
     return f"it is not proved that {fewer} not enough"
 
 
-def _planned_poles(plan: SensorPlan) -> list[PlannedPole]:
-    """One mark per location; sensors at the same location share it."""
+def plan_headline(plan: SensorPlan, titles: Mapping[str, str]) -> str:
+    """Return the plan and its joint score in one sentence; sensors are named where they are few.
+
+    Parameters
+    ----------
+    plan
+        The plan, of at least one sensor.
+    titles
+        What people call its sites (:func:`egvs.results.ranking.site_titles`).
+    """
+    count = len(plan.sensors)
+    names = "; ".join(titles[sensor.site] for sensor in plan.sensors)
+    if count > _MAX_NAMED or plan.refinement is not None:  # the titles are those of candidates
+        names = join_names(list(dict.fromkeys(sensor.pole for sensor in plan.sensors)))
+    score = plan.by.says.format(plan.by.with_unit(plan.joint, plan.joint_se))
+    return f"The plan of {number_of(count, 'sensor')} {score}: {names}"
+
+
+def planned_poles(plan: SensorPlan) -> list[PlannedPole]:
+    """Return a mark for each location of a plan; sensors at the same location share it."""
     sensors_at: dict[tuple[float, float], list[PlannedSensor]] = {}
     for sensor in plan.sensors:
         sensors_at.setdefault((sensor.x_m, sensor.y_m), []).append(sensor)
     poles = []
     for (x_m, y_m), members in sensors_at.items():
-        name = members[0].site
-        if len(members) > 1:
-            name += f" +{len(members) - 1}"
-        gain = 0.0
-        if plan.joint:
-            gain = sum(sensor.gain for sensor in members) / plan.joint
         numbers, details = [], []
         for sensor in members:
             numbers.append(str(sensor.order))
             adds = plan.by.with_unit(sensor.gain)
             details.append(f"{sensor.order}. {sensor.site}, {sensor.z_m:g} m high, adds {adds}")
-        poles.append(
-            PlannedPole(x_m, y_m, ", ".join(numbers), f"{name}: {format_percent(gain, 0)}", "; ".join(details))
-        )
+        poles.append(PlannedPole(x_m, y_m, ", ".join(numbers), members[0].pole, "; ".join(details)))
     return poles

@@ -26,6 +26,8 @@ _MIN_LEAD = 0.0005
 COMPARED_SITES = 3
 """Number of best sites that :func:`ranking_disagreement` compares."""
 
+_NO_TITLES: Mapping[str, str] = {}
+
 RHO_RANGE = (
     "{:.2f} to {:.2f}, depending on junction and detector; among sites of equal height, {:.2f} to {:.2f} (before the "
     "models were corrected for streets; after it {:.2f} to {:.2f} at {} of the 6 junctions)".format(
@@ -55,14 +57,13 @@ def level(site: RankedSite, found: DetectionLevel) -> str:
     Returns
     -------
     str
-        E.g. "detectors (cluster, pointpillars) should find 84 ± 6 % of vehicles; people would notice 90 ± 10 % in its
-        sweeps (curves of one junction)". For a score without detectors it begins with a verb: "sees 60.0 % of vehicles
-        well".
+        E.g. "detectors should find 84 ± 6 % of vehicles; people would notice 90 ± 10 %". For a score without detectors
+        it begins with a verb: "sees 60.0 % of vehicles well".
     """
     detectors = found.detectors
     if not detectors:
         return site.by.sentence(site.score)
-    names = f"detectors ({', '.join(detectors)})" if len(detectors) > 1 else f"the detector {detectors[0]}"
+    names = "detectors" if len(detectors) > 1 else f"the detector {detectors[0]}"
     if found.is_measured:
         text = f"{names} {site.by.says.format(found.text(site.score, site.score_se))}"
         if found.range is not None:
@@ -72,7 +73,7 @@ def level(site: RankedSite, found: DetectionLevel) -> str:
         without = "" if found.has_losses else " without losses of returns"
         text = f"{NOT_MEASURED} for {names}{without}"
     if site.noticed is not None:
-        text += f"; people would notice {site.noticed.text} in its sweeps (curves of one junction)"
+        text += f"; people would notice {site.noticed.text}"
     return text
 
 
@@ -91,23 +92,40 @@ def noticed_preference(ranking: Ranking) -> str:
     )
 
 
-def headline(ranking: Ranking, has_traffic: bool, found: DetectionLevel = NO_DETECTORS) -> str:
-    """Return the result in one sentence; ``found`` as for :func:`level`."""
+def headline(
+    ranking: Ranking, has_traffic: bool, found: DetectionLevel = NO_DETECTORS, titles: Mapping[str, str] = _NO_TITLES
+) -> str:
+    """Return the result in one sentence.
+
+    Parameters
+    ----------
+    ranking
+        The sites.
+    has_traffic
+        Whether there is any traffic in the region.
+    found
+        As for :func:`level`.
+    titles
+        What people call the sites (:func:`egvs.results.ranking.site_titles`); by default their names.
+    """
     detectors = found.detectors
     best, count = ranking.best, len(ranking.sites)
     top = best[0]
+    title = titles.get(top.site, top.site)
+    comma = "," if "," in title else ""
+    subject = f"P{title[1:]}" if title.startswith("pole ") else title
     if not has_traffic:
         return "No traffic in the region: the sites cannot be ranked"
     if not top.score > 0:
-        return "No site sees any of the traffic" if count > 1 else f"{top.site} sees none of the traffic"
+        return "No site sees any of the traffic" if count > 1 else f"{subject}{comma} sees none of the traffic"
 
     by_egvs = top.rank_by == "egvs"
     result = level(top, found)
     if by_egvs:
         result = f"sees {format_percent(top.entropy_seen)} of the traffic’s uncertainty"
-    of_first = f"; from {top.site}, {result}" if detectors else f": {top.site} {result}"
+    of_first = f"; from {title}, {result}" if detectors else f": {title}{comma} {result}"
     if count == 1:
-        return f"{top.site}, the only site{':' if detectors else ','} {result}"
+        return f"{subject}, the only site{':' if detectors else ','} {result}"
     if ranking.is_tie:
         text = f"All {count} sites score the same"
         if by_egvs and len({site.entropy_seen for site in best}) > 1:
@@ -118,7 +136,7 @@ def headline(ranking: Ranking, has_traffic: bool, found: DetectionLevel = NO_DET
     if len(best) > 1:
         names = join_names([site.site for site in best])
         return f"{names} share first place among {count} sites{of_first}"
-    text = f"{top.site} is the best of {count} sites"
+    text = f"{subject}{comma} is the best of {count} sites"
     if by_egvs:
         return text
     return f"{text}: {result}" if detectors else f"{text}: it {result}"
@@ -162,6 +180,26 @@ def recorded_frames_hint(scenario: Scenario, ranking: Ranking, stages: Mapping[s
     if "traffic" not in stages:
         return ""
     return more_frames_hint(scenario, ranking.by, stages["traffic"].summary["frames"])
+
+
+def short_lead(ranking: Ranking) -> str:
+    """Return how far the best site is ahead of the best one on another pole, and whether that is clear.
+
+    The next site takes the place of the latter where there is one pole. Empty if no site leads.
+    """
+    if ranking.is_tie or not ranking.best[0].score > 0:
+        return ""
+    rival, name = ranking.sites[len(ranking.best)], ""
+    if (on_another_pole := _best_on_another_pole(ranking)) is not None:
+        rival, name = on_another_pole, on_another_pole.pole
+    text = f"{by_number(len(ranking.best), 'It leads', 'They lead')} {name or rival.site}"
+    text += f" by {_format_gap(ranking, rival)}"
+    if rival.best_beats is None:
+        return f"{text}."
+    probability = format_probability(rival.best_beats)
+    if rival.is_below_best:
+        return f"{text} (better with a probability of {probability})."
+    return f"{text}. That is not clear: the probability that it is better is {probability}."
 
 
 def lead(ranking: Ranking, hint: str = "") -> str:

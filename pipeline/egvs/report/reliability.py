@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from egvs.core.errors import Diagnostic
 from egvs.core.wording import format_percent
 from egvs.report.ranking_text import FROM_SENSOR_NOTE
 from egvs.results.labels import join_names
@@ -76,6 +77,8 @@ def describe_reliability(
     if ranking.has_errors and (seeds > 1 or ranking.by.name == DEFAULT_SCORE):
         notes.append(_error_note(seeds, "recording" if recordings else "simulation", detectors))
     if ranking.by.name == DEFAULT_SCORE:
+        if len(detectors) > 1 and not ranking.has_errors:
+            notes.append(f"The score is the mean over the detectors {join_names(detectors)}.")
         notes.append(FROM_SENSOR_NOTE if FROM_SENSOR in detectors else _size_note(detectors))
         if best.noticed is not None:
             notes.append(_NOTICED_NOTE)
@@ -140,3 +143,32 @@ def _limits(best: RankedSite, on_pole: Sequence[RankedSite]) -> Iterator[str]:
     steepest_deg = min(site.pitch_deg for site in on_pole)
     if best.pitch_deg == steepest_deg <= -MIN_TILT_DEG and any(site.pitch_deg > steepest_deg for site in on_pole):
         yield f"the steepest tilt tried ({best.pitch_deg:.0f} degrees)"
+
+
+# ---- warnings
+
+_BY_SEVERITY = (
+    ("no vehicles",),
+    ("no ranking",),
+    (
+        "overlaps in roi",
+        "overlaps",
+        "collisions",
+        "waiting",
+        "standing",
+        "teleports",
+        "jumps",
+        "traffic through solids",
+    ),
+    ("sites on lanes", "blocked sites", "measured scan", "vehicles off their lanes", "vehicles against lanes"),
+    ("mesh units", "mesh axes", "few beams", "beam angles", "blind sites", "track alignment"),
+)
+"""Rules of warnings that make a result worthless, that tell of traffic that cannot be, of sites where no sensor can
+stand, and of scenes that are not as they are in reality; all other warnings are less serious."""
+
+
+def by_severity(warnings: Iterable[Diagnostic]) -> list[Diagnostic]:
+    """Return different warnings, the most serious first; equally serious ones in their order."""
+    order = {rule: number for number, rules in enumerate(_BY_SEVERITY) for rule in rules}
+    distinct = dict.fromkeys(warnings)
+    return sorted(distinct, key=lambda warning: order.get(warning.rule, len(_BY_SEVERITY)))

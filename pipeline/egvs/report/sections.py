@@ -13,9 +13,10 @@ from typing import Any
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import Diagnostic
+from egvs.core.wording import list_first
 from egvs.results.labels import join_names
 from egvs.results.ranking import Pole
-from egvs.scenario.model import Scenario
+from egvs.scenario.model import NO_SURROUNDINGS, POLE_POSITIONS, Scenario
 from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.signal_descriptions import ASSUMED_SOURCE, plan_title
@@ -42,7 +43,8 @@ def assumptions(scenario: Scenario, plans: Sequence[Mapping[str, Any]]) -> tuple
     Parameters
     ----------
     scenario
-        The scenario. Where it has plans of signals, those that are still assumed are named, if there are any.
+        The scenario. Where it has plans of signals, those that are still assumed are named, if there are any. Poles
+        that exist are not assumed; that nothing stands beside the road is.
     plans
         Plans of the signals in the region, from the summary of the traffic
         (:func:`egvs.traffic.signal_descriptions.describe_signals`).
@@ -53,10 +55,44 @@ def assumptions(scenario: Scenario, plans: Sequence[Mapping[str, Any]]) -> tuple
         remaining = [plan_title(plan) for plan in plans if plan["source"] == ASSUMED_SOURCE]
         named = (f"{ASSUMED_PLANS} of {join_names(remaining)}",) if remaining else ()
         assumed = tuple(chain.from_iterable(named if entry == ASSUMED_PLANS else (entry,) for entry in assumed))
+    if scenario.sites.existing_poles == "all":
+        assumed = tuple(entry for entry in assumed if entry != POLE_POSITIONS)
+    elif scenario.sites.existing_poles:
+        others = f"{POLE_POSITIONS} other than {join_names(scenario.sites.existing_poles)}"
+        assumed = tuple(others if entry == POLE_POSITIONS else entry for entry in assumed)
+    statics = scenario.statics
+    has_surroundings = statics.footprints or statics.polygons or statics.meshes or scenario.sites.points
+    if not has_surroundings and NO_SURROUNDINGS not in assumed:
+        assumed = (*assumed, NO_SURROUNDINGS)
     has_demand = traffic.network is None or bool(traffic.counts or traffic.routes)
     if has_demand or any(period.counts or period.routes for period in traffic.periods):
         return assumed
     return (*assumed, "traffic (random trips)")
+
+
+_BY_IMPORTANCE = ("traffic", "building is known", "surroundings", "positions", "signal", "heights of .*building")
+"""Beginnings of what scenarios assume, that which affects a ranking most first; all other entries follow."""
+
+
+_LONG = 75
+"""Longer lists of assumptions leave out what is in brackets."""
+
+
+def main_assumptions(assumed: Sequence[str], count: int = 2) -> str:
+    """Return the assumptions that affect a ranking most, and how many more there are, in one sentence.
+
+    Empty where nothing is assumed. ``assumed`` is from :func:`assumptions`.
+    """
+
+    def order(entry: str) -> int:
+        return next((n for n, word in enumerate(_BY_IMPORTANCE) if re.search(word, entry)), len(_BY_IMPORTANCE))
+
+    if not assumed:
+        return ""
+    named = list_first(sorted(assumed, key=order), count, "; ")
+    if len(named) > _LONG:
+        named = re.sub(r" \([^)]*\)", "", named)
+    return f"Assumed, not measured: {named}."
 
 
 def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]) -> list[str]:

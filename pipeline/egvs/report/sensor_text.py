@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from egvs.core.wording import by_number
+from egvs.artefacts.readers import DISTINCT_PROBABILITY
+from egvs.core.wording import by_number, format_percent
 from egvs.results.labels import SCORE_LABELS, join_names
 from egvs.results.levels import MIN_NOTICED_LEAD, DetectionLevel, GroupLevel
+from egvs.results.ranking import RankedSite
 from egvs.results.sensors import SensorComparison, difference_unit
 from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
@@ -14,15 +16,16 @@ from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.sensors.return_model import REFLECTIVITY_INTERVAL
 from egvs.sensors.sensor import scenario_sensor
 
+_ADVICE = "Do not decide between sensors by less than about 10 points."
+
 SENSOR_EVIDENCE = (
     "How far to trust this: in simulation without losses of returns, at six held-out junctions with twelve sensors, "
     "the mean of cluster and pointpillars, before their correction for streets, ranked sites nearly as three detectors "
     "do (rank correlation {rho[0]:.2f} to {rho[1]:.2f}; after it {corrected[0]:.2f} to {corrected[1]:.2f} at three of "
     "the six). But the first of a ranking lost up to {loss_points} points of AP, and {largest_loss_points} once; "
     "shares found with {underrated_sensors[0]} and {underrated_sensors[1]} are {underrated_points[0]} to "
-    "{underrated_points[1]} points higher than expected. Do not decide between sensors by less than about 10 points, "
-    "nor by the cost of one more point. See docs/validity.md."
-).format(**dict(STUDY.larger_study), corrected=STUDY.street_levels.rho_in_larger_study)
+    "{underrated_points[1]} points higher than expected. {advice} See docs/validity.md."
+).format(advice=_ADVICE, **dict(STUDY.larger_study), corrected=STUDY.street_levels.rho_in_larger_study)
 """What is known about rankings of sensors by the recommended score (docs/validity.md)."""
 
 _NO_EVIDENCE = (
@@ -43,19 +46,11 @@ LOSSES_EVIDENCE = (
 )
 """What is known about losses of returns."""
 
-_INTERVAL_SENTENCE = (
-    "± contains the interval of the reflectivity, 0.03 to 0.06, the same for all sensors, but no error of a maker's "
-    "rated range."
-)
+_INTERVAL_SENTENCE = "± contains the interval of the reflectivity, 0.03 to 0.06, but no error of a maker's rated range."
 
 _NO_INTERVAL_SENTENCE = (
     "± does not contain the interval of the reflectivity, 0.03 to 0.06: egvs compare SCENARIO --sensors adds it."
 )
-
-
-def describe_losses(*, has_interval: bool) -> str:
-    """Return what is known about losses of returns, and whether errors of differences contain their interval."""
-    return f"{LOSSES_EVIDENCE} {_INTERVAL_SENTENCE if has_interval else _NO_INTERVAL_SENTENCE}"
 
 
 def describe_order(comparison: SensorComparison) -> str:
@@ -145,17 +140,23 @@ def range_note(sensors: Iterable[str], *, is_modelled: bool) -> str:
     return _RANGE_NOTE
 
 
-def explain_differences(comparison: SensorComparison) -> str:
-    """Return what the differences between sensors, and the cost of one more point, refer to."""
+def explain_differences(reference: str, site: RankedSite) -> str:
+    """Return what differences from a run or a sensor are; ``site`` is one of the compared sites."""
+    probability = format_percent(DISTINCT_PROBABILITY, 0)
+    return (
+        f"Differences from {reference} are in {difference_unit(site)}, ± their standard error; ~ it is not clear which "
+        f"is better (probability below {probability})."
+    )
+
+
+def explain_sensor_differences(comparison: SensorComparison) -> str:
+    """Return what the differences between sensors refer to."""
     kind = "the cheapest" if comparison.has_costs else "which finds least"
     unpriced = ""
     if comparison.has_costs and comparison.unpriced:
         kind = "the cheapest with a known cost"
         unpriced = f" Without a known cost: {', '.join(comparison.unpriced)}."
-    return (
-        f"Differences from {comparison.baseline_name} ({kind}) are in {difference_unit(comparison.baseline.site)}, "
-        f"± their standard error; ~ it is not clear which is better.{unpriced}"
-    )
+    return f"{explain_differences(f'{comparison.baseline_name} ({kind})', comparison.baseline.site)}{unpriced}"
 
 
 def noticed_preference(comparison: SensorComparison) -> str:
@@ -182,6 +183,16 @@ def describe_evidence(comparison: SensorComparison) -> str:
     if by.name == DEFAULT_SCORE:
         return SENSOR_EVIDENCE
     return _NO_EVIDENCE.format(by.noun, SCORE_LABELS[DEFAULT_SCORE].noun)
+
+
+def describe_trust(comparison: SensorComparison) -> str:
+    """Return in a line or two how far to trust a comparison of sensors; :func:`describe_evidence` says why."""
+    by = comparison.baseline.site.by
+    text = f"Whether {by.noun} ranks different sensors as detectors do was not measured."
+    if by.name == DEFAULT_SCORE:
+        text = _ADVICE
+    interval = _INTERVAL_SENTENCE if comparison.has_loss_interval else _NO_INTERVAL_SENTENCE
+    return f"{text} {interval} See docs/validity.md and docs/certainty.md."
 
 
 def costs_option(sensors: Iterable[str]) -> str:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import pyarrow as pa
 
@@ -95,9 +96,10 @@ class RankedSite:
             Name of the score that ranks; the metadata of the table has it.
         """
         names = [column.name for column in fields(cls) if column.name in scores.column_names]
-        known = {*parquet.column_names("scores"), *names}
+        known = {*parquet.column_names("scores"), *names, rank_by, f"{rank_by}_se"}
         user_names = [name for name in scores.column_names if name not in known]
-        other_names = [name for name in SCORE_LABELS if name != "egvs" and name in scores.column_names]
+        other_names = [name for name in dict.fromkeys([*SCORE_LABELS, rank_by]) if name in scores.column_names]
+        other_names.remove("egvs")
 
         sites = []
         for row in scores.to_pylist():
@@ -227,6 +229,70 @@ class Pole:
             texts = dict.fromkeys(text for _, text in column if text)
             columns.append(", ".join(texts))
         return tuple(columns)
+
+
+class Mounted(Protocol):
+    """A sensor on a pole: a ranked site, or a sensor of a plan."""
+
+    @property
+    def site(self) -> str:
+        """Name of the site."""
+
+    @property
+    def pole(self) -> str:
+        """Name of its pole."""
+
+    @property
+    def z_m(self) -> float:
+        """Height in the world frame."""
+
+    @property
+    def pitch_deg(self) -> float:
+        """Tilt, positive upwards."""
+
+    @property
+    def roll_deg(self) -> float:
+        """Rotation about the axis of the sensor."""
+
+
+_HEIGHT_IN_NAME = re.compile(r"@([0-9.]+)m")
+"""What :mod:`egvs.sensors.sites` adds to the name of a site that has several heights; it counts from the ground."""
+
+
+def describe_mount(mount: Mounted, *, has_relief: bool = False) -> str:
+    """Return height and tilt of a sensor in words, e.g. "3 m up, level" or "4.5 m up, tilted 10° down".
+
+    Parameters
+    ----------
+    mount
+        The sensor.
+    has_relief
+        Whether the ground is elsewhere than at z = 0, so that z is no height above it.
+    """
+    named = _HEIGHT_IN_NAME.search(mount.site.removeprefix(mount.pole))
+    if named is not None:
+        height = f"{named[1]} m up"
+    else:
+        height = f"at z {mount.z_m:.4g} m" if has_relief else f"{mount.z_m:.4g} m up"
+    tilt = "level"
+    if pitch_deg := round(mount.pitch_deg, 1):
+        tilt = f"tilted {abs(pitch_deg):g}° {'up' if pitch_deg > 0 else 'down'}"
+    if roll_deg := round(mount.roll_deg, 1):
+        tilt += ", upside down" if abs(roll_deg) == 180 else f", rolled by {roll_deg:g}°"
+    return f"{height}, {tilt}"
+
+
+def site_titles(mounts: Iterable[Mounted], *, has_relief: bool = False) -> dict[str, str]:
+    """Return what people call sites, by their names, e.g. "pole k04, 3 m up, level" for "k04@3m+0deg".
+
+    Sites that would have the same title have their name in it. The parameters are those of :func:`describe_mount`.
+    """
+    titles = {}
+    for mount in mounts:
+        noun = "" if "pole" in mount.pole.lower() else "pole "
+        titles[mount.site] = f"{noun}{mount.pole}, {describe_mount(mount, has_relief=has_relief)}"
+    count = Counter(titles.values())
+    return {site: title if count[title] == 1 else f"{title} ({site})" for site, title in titles.items()}
 
 
 def companion_score(sites: Sequence[RankedSite]) -> ScoreLabel | None:

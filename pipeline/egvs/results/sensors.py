@@ -1,13 +1,7 @@
-r"""The best mount of each sensor, and what one more percentage point of vehicles found costs.
+"""The best mount of each sensor, and what it costs.
 
-Sensor i has the cost :math:`c_i` (with its pole and height, as ``[costs]`` says), and its best mount the score
-:math:`s_i`, a share. Compared with the cheapest sensor b, one more percentage point costs
-
-.. math:: \frac{c_i - c_b}{100 \, (s_i - s_b)}
-
-This is undefined where sensor i finds no more than b, and not stated where it is not clear which of them finds more.
-The same is computed for the best of all sensors that are cheaper than i: a large gain over the cheapest can hide that
-the last step costs much and adds little. Without costs, the sensor that finds least takes the place of the cheapest.
+The cost is that of the sensor with its pole and height, as ``[costs]`` says. Sensors are compared with the cheapest
+one; without costs, with the one that finds least.
 """
 
 from __future__ import annotations
@@ -22,6 +16,7 @@ from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.results.labels import format_count
 from egvs.results.ranking import RankedSite
 from egvs.scenario.score_config import COST_COLUMN, CostsConfig
+from egvs.sensors.sites import pole_exists
 
 _PROBABILITY_DIGITS = 6
 """The last bits of a distribution function depend on the machine."""
@@ -106,7 +101,9 @@ class SensorMount:
         return self.site.sensor
 
 
-def best_mounts(sites: Iterable[RankedSite], costs: CostsConfig, run: str = "") -> tuple[SensorMount, ...]:
+def best_mounts(
+    sites: Iterable[RankedSite], costs: CostsConfig, run: str = "", existing_poles: Sequence[str] = ()
+) -> tuple[SensorMount, ...]:
     """Return the best mount of each sensor.
 
     Parameters
@@ -117,14 +114,16 @@ def best_mounts(sites: Iterable[RankedSite], costs: CostsConfig, run: str = "") 
         Costs of the scenario.
     run
         Label of the run.
+    existing_poles
+        Those of ``[sites]``.
     """
     best: dict[str, RankedSite] = {}
     for site in sites:
         best.setdefault(site.sensor, site)
-    return tuple(SensorMount(run, site, site_cost(site, costs)) for site in best.values())
+    return tuple(SensorMount(run, site, site_cost(site, costs, existing_poles)) for site in best.values())
 
 
-def site_cost(site: RankedSite, costs: CostsConfig) -> float | None:
+def site_cost(site: RankedSite, costs: CostsConfig, existing_poles: Sequence[str] = ()) -> float | None:
     """Return the cost of a site, from its column ``cost`` or ``[costs]``; None if that of its sensor is unknown."""
     text = dict(site.user_columns).get(COST_COLUMN)
     if text:
@@ -135,41 +134,7 @@ def site_cost(site: RankedSite, costs: CostsConfig) -> float | None:
         return cost if 0.0 <= cost < math.inf else None
     if site.sensor not in costs.sensor:
         return None
-    return costs.of_mount(site.sensor, site.z_m)
-
-
-@dataclass(frozen=True)
-class SensorGain:
-    """A mount compared with a cheaper one.
-
-    Attributes
-    ----------
-    difference
-        Its score minus that of the cheaper one.
-    cost_per_point
-        Cost of one more percentage point; None where it is undefined, not clear or unknown.
-    """
-
-    difference: ScoreDifference
-    cost_per_point: float | None
-
-    @classmethod
-    def of(cls, mount: SensorMount, cheaper: SensorMount, difference: ScoreDifference) -> SensorGain:
-        """Return the gain of a mount over a cheaper one, from the difference of their scores."""
-        if mount.cost is None or cheaper.cost is None or not mount.site.by.is_share:
-            return cls(difference, None)
-        if difference.value <= 0.0 or not difference.is_clear:
-            return cls(difference, None)
-        return cls(difference, (mount.cost - cheaper.cost) / (100.0 * difference.value))
-
-    @property
-    def cost_text(self) -> str:
-        """The cost of one more percentage point, or why there is none."""
-        if self.cost_per_point is not None:
-            return format_count(self.cost_per_point)
-        if not self.difference.is_clear:
-            return "not clear"
-        return "no gain" if self.difference.value <= 0.0 else "-"
+    return costs.of_mount(site.sensor, site.z_m, pole_exists=pole_exists(site.pole, existing_poles))
 
 
 @dataclass(frozen=True)
@@ -181,14 +146,11 @@ class SensorResult:
     mount
         Its best mount.
     gain
-        Compared with the baseline; None for the baseline.
-    step
-        Compared with the best of all cheaper ones; None for the baseline, and where a cost is unknown.
+        Its score minus that of the baseline; None for the baseline.
     """
 
     mount: SensorMount
-    gain: SensorGain | None = None
-    step: SensorGain | None = None
+    gain: ScoreDifference | None = None
 
     @property
     def cost_text(self) -> str:
@@ -198,19 +160,7 @@ class SensorResult:
     @property
     def gain_text(self) -> str:
         """The gain with its standard error: in percentage points for shares; ``~`` marks one that is not clear."""
-        return "-" if self.gain is None else format_difference(self.gain.difference, self.mount.site)
-
-    @property
-    def cost_per_point_text(self) -> str:
-        """The cost of one more percentage point than the baseline."""
-        if self.gain is None or self.mount.cost is None:
-            return "-"
-        return self.gain.cost_text
-
-    @property
-    def step_cost_text(self) -> str:
-        """The cost of one more percentage point than the best cheaper mount."""
-        return "-" if self.step is None else self.step.cost_text
+        return "-" if self.gain is None else format_difference(self.gain, self.mount.site)
 
 
 @dataclass(frozen=True)
@@ -259,23 +209,18 @@ class SensorComparison:
             return mount.cost, -mount.site.score
 
         baseline, *others = sorted(mounts, key=order)
-        best_cheaper = baseline
         results = [SensorResult(baseline)]
-        for mount in others:
-            gain = SensorGain.of(mount, baseline, difference(mount, baseline))
-            step = None
-            if has_costs and mount.cost is not None:
-                step = SensorGain.of(mount, best_cheaper, difference(mount, best_cheaper))
-            results.append(SensorResult(mount, gain, step))
-            if mount.site.score > best_cheaper.site.score:
-                best_cheaper = mount
+        results += [SensorResult(mount, difference(mount, baseline)) for mount in others]
         return cls(tuple(results), has_costs)
 
     @classmethod
-    def of_run(cls, sites: Sequence[RankedSite], costs: CostsConfig) -> SensorComparison | None:
+    def of_run(
+        cls, sites: Sequence[RankedSite], costs: CostsConfig, existing_poles: Sequence[str] = ()
+    ) -> SensorComparison | None:
         """Compare the sensors of one run, whose sites are by rank; errors of differences as if independent."""
         return cls.of(
-            best_mounts(sites, costs), lambda mount, other: ScoreDifference.of_independent(mount.site, other.site)
+            best_mounts(sites, costs, existing_poles=existing_poles),
+            lambda mount, other: ScoreDifference.of_independent(mount.site, other.site),
         )
 
     @property
@@ -310,16 +255,6 @@ class SensorComparison:
     def unpriced(self) -> tuple[str, ...]:
         """Names of the sensors whose cost is unknown."""
         return tuple(dict.fromkeys(result.mount.sensor for result in self.results if result.mount.cost is None))
-
-    @property
-    def shows_cost_per_point(self) -> bool:
-        """Whether one more percentage point can have a cost: costs are known, and the score is a share."""
-        return self.has_costs and self.baseline.site.by.is_share
-
-    @property
-    def has_steps(self) -> bool:
-        """Whether some mount has a better cheaper one than the baseline."""
-        return any(result.step is not None and result.step != result.gain for result in self.results)
 
 
 def format_difference(difference: ScoreDifference, site: RankedSite) -> str:

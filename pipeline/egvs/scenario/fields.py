@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -25,6 +25,10 @@ class StrictModel(BaseModel):
     def from_dict(cls, values: dict[str, Any]) -> Self:
         """Return the table with values as TOML gives them; pydantic's ValidationError when some are invalid."""
         return cls.model_validate_json(json.dumps(values, default=str), strict=True)
+
+
+SensorMount = Literal["upright", "inverted"]
+"""Whether the sensor stands, or hangs upside down with its front where it was: turned by 180 degrees about x."""
 
 
 def find_duplicates(names: Sequence[Any]) -> list[Any]:

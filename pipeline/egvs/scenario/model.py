@@ -29,7 +29,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import Grid, Roi
 from egvs.core.sumo_home import sumo_home
 from egvs.scenario.effects_config import EffectsConfig
-from egvs.scenario.fields import Latitude, Longitude, Name, Point2, Point3, Positive, StrictModel
+from egvs.scenario.fields import Latitude, Longitude, Name, Point2, Point3, Positive, SensorMount, StrictModel
 from egvs.scenario.score_config import CostsConfig, PlacementConfig, ScoreConfig, default_gamma
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.scenario.traffic_config import TrafficConfig
@@ -122,6 +122,12 @@ class MeshConfig(StrictModel):
             return f"EPSG:{self.epsg}"
         return None
 
+
+POLE_POSITIONS = "positions of the poles"
+"""Entry of the key ``assumed``: no candidate pole is known to exist."""
+
+NO_SURROUNDINGS = "surroundings (no building or tree is known)"
+"""Entry of the key ``assumed``: no map has anything that could hide vehicles."""
 
 TERRAIN_KEY = "statics.terrain"
 """The key of the file with the ground beyond the roads."""
@@ -253,12 +259,22 @@ class SitesConfig(StrictModel):
         description="Pitch, positive for nose up, or 'aim'; each value of a list is a candidate. By default 'aim' for "
         "sites that are aimed, else 0",
     )
-    roll_deg: float = Field(0.0, description="Roll about the sensor's x axis")
+    roll_deg: float = Field(0.0, description="Roll about the sensor's x axis; from upside down, if it is inverted")
+    mount: SensorMount | None = Field(
+        None, description="'inverted': upside down, with the front in the same direction. By default that of the sensor"
+    )
+    existing_poles: tuple[str, ...] | Literal["all"] = Field(
+        (), description="Names of poles that exist, or 'all': they cost nothing, and their positions are not assumed"
+    )
 
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out replace_sensor where it is not set, so that it does not change cache keys."""
-        return {name: value for name, value in serialize(self).items() if name != "replace_sensor" or value is not None}
+        """Leave out newer keys where they are not set, so that they do not change cache keys."""
+        values: dict[str, Any] = serialize(self)
+        for name in ("replace_sensor", "mount", "existing_poles"):
+            if not values.get(name):
+                values.pop(name, None)
+        return values
 
     @model_validator(mode="after")
     def _check_source(self) -> SitesConfig:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from egvs.core import limits
-from egvs.scenario.fields import NotNegative, Positive, StrictModel
+from egvs.scenario.fields import NotNegative, Positive, SensorMount, StrictModel
 
 MAX_RINGS = 10_000
 """More than ten times as many as any sensor has."""
@@ -111,6 +111,9 @@ class SensorConfig(StrictModel):
     range_sigma_m: NotNegative = Field(
         0.03, description="Standard deviation of measured ranges; used for point clouds with traffic only"
     )
+    mount: SensorMount = Field(
+        "upright", description="'inverted': upside down wherever no site says otherwise; its x axis keeps its direction"
+    )
 
     @property
     def beam_file(self) -> tuple[str, str] | None:
@@ -147,7 +150,7 @@ class SensorConfig(StrictModel):
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out optics and field of view that are not set, so that they do not change cache keys."""
-        omitted = {*OPTICS_KEYS, *_FIELD_OF_VIEW_KEYS} - self.model_fields_set
+        omitted = {*OPTICS_KEYS, *_FIELD_OF_VIEW_KEYS, "mount"} - self.model_fields_set
         return {name: value for name, value in serialize(self).items() if name not in omitted}
 
     @model_validator(mode="after")

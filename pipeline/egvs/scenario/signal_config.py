@@ -13,9 +13,9 @@ DEFAULT_MIN_GREEN_S = 5.0
 ASSUMED_PLANS = "signal plans"
 """Entry of the key ``assumed`` of a scenario whose signal plans netconvert has made."""
 
-Movements = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)]
+Movements = tuple[Annotated[str, Field(min_length=1)], ...]
 
-_PLAN_KEYS = ("type", "cycle_s", "yellow_s", "all_red_s", "phases")
+_PLAN_KEYS = ("all_red_s", "cycle_s", "phases", "type", "yellow_s")
 """Keys that a program in a SUMO file sets itself."""
 
 
@@ -23,10 +23,10 @@ class SignalPhaseConfig(StrictModel):
     """A phase of a signal plan: who has green, and for how long."""
 
     green: dict[str, Movements] = Field(
-        min_length=1,
         description="Movements with green by approach, e.g. { north = ['straight', 'right'] }. An approach is the"
         " compass direction that it comes from, its street, both ('Main Street (north)') or an edge; a movement is"
-        " left, straight, right, U-turn, crosswalk or all",
+        " left, straight, right, U-turn, crosswalk or all. {} is red for all vehicles; { north = [] } keeps an approach"
+        " red that is in no phase",
     )
     green_s: Positive = Field(description="Green time; with actuated signals, that without any detection")
     yellow_s: float | None = Field(None, ge=0, description="Yellow after this phase, instead of that of the plan")
@@ -90,14 +90,14 @@ class SignalConfig(StrictModel):
         if (self.file is None) == (not self.phases):
             raise ValueError(f"expected either phases or file, got {'both' if self.phases else 'none'}")
         if self.is_sumo_file:
-            unused = sorted(self.model_fields_set & set(_PLAN_KEYS))
+            unused = [key for key in _PLAN_KEYS if getattr(self, key) != type(self).model_fields[key].default]
             if unused:
                 raise ValueError(f"{', '.join(unused)} has no effect with a <tlLogic> file. Change it there")
         if self.type == "actuated" and self.cycle_s is not None:
             raise ValueError("cycle_s has no effect with actuated signals. Remove it")
         if self.type == "fixed":
             for phase in self.phases:
-                unused = sorted(phase.model_fields_set & {"min_green_s", "max_green_s"})
+                unused = [key for key in ("max_green_s", "min_green_s") if getattr(phase, key) is not None]
                 if unused:
                     raise ValueError(f'{", ".join(unused)} has no effect with a fixed plan. Set type = "actuated"')
         return self

@@ -14,7 +14,7 @@ axis is :math:`n = (\sin p,\; \cos p \sin r,\; \cos p \cos r)`. Yaw and position
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -70,6 +70,16 @@ class GroundPlane:
     x_m: tuple[float, float]
     y_m: tuple[float, float]
 
+    def upside_down(self) -> GroundPlane:
+        """The same plane in the frame of a sensor that is turned by 180 degrees about its x axis."""
+        low_m, high_m = self.y_m
+        return replace(
+            self,
+            normal=self.normal * (1.0, -1.0, -1.0),
+            roll_deg=self.roll_deg - math.copysign(180.0, self.roll_deg),
+            y_m=(-high_m, -low_m),
+        )
+
     def distance_m(self, points_m: FloatArray) -> FloatArray:
         """Height of points (..., 3) above the plane."""
         distance: FloatArray = points_m @ self.normal + self.height_m
@@ -108,7 +118,7 @@ def find_ground_planes(points_m: FloatArray, normals: FloatArray, where: str) ->
         away = np.abs(planes[-1].distance_m(rest)) > _REMOVED_M
         rest, normals = rest[away], normals[away]
     if not planes:
-        hint = "Give sweeps in which the road is visible, with z upwards."
+        hint = "Give sweeps in which the road is visible; of a sensor that is upside down, with --mount inverted."
         raise InputError(where, "expected a ground plane below the sensor, got none", hint)
     return planes
 

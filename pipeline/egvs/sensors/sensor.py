@@ -370,7 +370,7 @@ class _Catalogue(Mapping[str, Sensor]):
 
 CATALOGUE: Mapping[str, Sensor] = _Catalogue()
 """The built-in sensors. A new one needs an entry in ``catalogue.toml``, its number of beams in
-``tests/sensors/test_sensor.py``, and a row in ``docs/effects.md`` with the source of its rated range."""
+``tests/sensors/test_sensor.py``, and a row in ``docs/data/rated_ranges.csv``."""
 
 
 def scenario_sensor(name: str, scenario: Scenario, where: str) -> Sensor:

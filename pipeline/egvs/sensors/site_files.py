@@ -38,7 +38,7 @@ from egvs.scenario.fields import same_name
 REQUIRED_COLUMNS = ("site", "x_m", "y_m", "z_m")
 AIM_COLUMNS = ("aim_x_m", "aim_y_m", "aim_z_m")
 NUMBER_COLUMNS = ("x_m", "y_m", "z_m", "ground_m", "yaw_deg", "pitch_deg", "roll_deg", *AIM_COLUMNS)
-TEXT_COLUMNS = ("sensor", "points", "aim")
+TEXT_COLUMNS = ("sensor", "points", "aim", "mount")
 KNOWN_COLUMNS = ("site", *NUMBER_COLUMNS, *TEXT_COLUMNS)
 
 LONGITUDE = ("lon", "lng", "longitude", "lon_deg", "longitude_deg")

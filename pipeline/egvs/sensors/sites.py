@@ -24,10 +24,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from egvs.core.errors import InputError, parse_each, raise_together, unknown_sit
 from egvs.core.grid import Vec3
 from egvs.core.special import cosdg, sindg
 from egvs.formats import vector_files
-from egvs.scenario.fields import MAX_COORDINATE_M, same_name
+from egvs.scenario.fields import MAX_COORDINATE_M, SensorMount, same_name
 from egvs.scenario.model import Scenario, SiteGrid, SiteLine
 from egvs.sensors import site_files
 from egvs.sensors.sensor import Sensor, scenario_sensor
@@ -73,9 +73,29 @@ class Pose:
         return self.x_m, self.y_m, self.z_m
 
     @property
+    def is_inverted(self) -> bool:
+        """Whether the sensor is upside down."""
+        return abs(wrap_deg(self.roll_deg)) > 90.0
+
+    @property
+    def side_tilt_deg(self) -> float:
+        """The roll from upright, or from upside down, of which it is nearer; -90 to 90."""
+        roll_deg = wrap_deg(self.roll_deg)
+        return wrap_deg(roll_deg + 180.0) if self.is_inverted else roll_deg
+
+    @property
     def angles_deg(self) -> Vec3:
         """(yaw, pitch, roll)."""
         return self.yaw_deg, self.pitch_deg, self.roll_deg
+
+
+def wrap_deg(angle_deg: float) -> float:
+    """Return an angle above -180 and up to 180 degrees.
+
+    >>> wrap_deg(180.0), wrap_deg(-180.0), wrap_deg(182.5)
+    (180.0, 180.0, -177.5)
+    """
+    return 180.0 - (180.0 - angle_deg) % 360.0
 
 
 def grid_bearing_deg(yaw_deg: float) -> float:
@@ -188,8 +208,17 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
     if not sites:
         raise InputError(path, "expected at least one site, got none")
     _check_unused_keys(scenario, builder.used_keys, path)
+    poles = list(dict.fromkeys(site.pole for site in sites.values()))
+    for pole in scenario.sites.existing_poles if scenario.sites.existing_poles != "all" else ():
+        if pole not in poles:
+            raise unknown_site(f"{scenario.file}: sites.existing_poles", pole, poles)
     _check_keep_visibility(scenario, sites)
     return _with_measured_scan(tuple(sites.values()), scenario)
+
+
+def pole_exists(pole: str, existing: Sequence[str]) -> bool:
+    """Return whether a pole is one of ``sites.existing_poles``."""
+    return existing == "all" or pole in existing
 
 
 def _site_rows(scenario: Scenario, path: Path) -> tuple[Iterable[SiteRow], list[InputError]]:
@@ -199,14 +228,14 @@ def _site_rows(scenario: Scenario, path: Path) -> tuple[Iterable[SiteRow], list[
         world = geolocation.scenario_georeference(scenario)
         if path.suffix.lower() in (".geojson", ".json") or vector_files.is_gis_file(path):
             is_kml = path.suffix.lower() in vector_files.KML_SUFFIXES
-            return site_files.read_features(path, world, has_relief=is_kml and _has_relief(scenario)), []
+            return site_files.read_features(path, world, has_relief=is_kml and has_relief(scenario)), []
         return site_files.read_table(path, world)
     if config.grid is not None:
         return _grid_rows(config.grid), []
     return _line_rows(config.along), []
 
 
-def _has_relief(scenario: Scenario) -> bool:
+def has_relief(scenario: Scenario) -> bool:
     """Whether the ground is elsewhere than at z = 0."""
     if scenario.statics.terrain is not None:
         return True
@@ -225,6 +254,7 @@ _OVERRIDING_COLUMNS = {
     "yaw_deg": "yaw_deg or aim",
     "pitch_deg": "pitch_deg",
     "roll_deg": "roll_deg",
+    "mount": "mount",
 }
 """Keys of ``[sites]`` that are defaults for rows, and the columns that override them."""
 
@@ -315,7 +345,8 @@ class _SiteBuilder:
         name = str(columns["site"]).strip()
         sensor_name = self._sensor_name(columns)
         points = str(columns["points"]).strip() if columns.get("points") else None
-        request = _mount_request(row, self.scenario)
+        is_inverted = self._is_inverted(row, sensor_name)
+        request = _mount_request(row, self.scenario, is_inverted=is_inverted)
         if columns.get("roll_deg") in (None, ""):
             self.used_keys.add("roll_deg")
         pole = self._poles.setdefault((request.x_m, request.y_m), name)
@@ -342,6 +373,17 @@ class _SiteBuilder:
             return name
         self.used_keys.add("sensor")
         return config.sensor
+
+    def _is_inverted(self, row: SiteRow, sensor_name: str) -> bool:
+        """Whether the sensor is upside down: by the row, else by ``[sites]``, else by the sensor."""
+        mount = str(row.columns.get("mount") or "").strip()
+        if not mount:
+            self.used_keys.add("mount")
+            own = self.scenario.sensors.get(sensor_name)
+            mount = self.scenario.sites.mount or ("upright" if own is None else own.mount)
+        if mount not in get_args(SensorMount):
+            raise InputError(f"{row.where}: mount", f"expected upright or inverted, got {mount[:80]!r}")
+        return mount == "inverted"
 
     def _mounts(self, where: str, request: MountRequest, sensor_name: str) -> list[Mount]:
         """Every combination of height and pitch of a row; InputError for an aim that no mount meets."""
@@ -492,7 +534,7 @@ def _check_columns(row: SiteRow, scenario: Scenario) -> None:
             raise InputError(f"{row.where}: {key}", f"expected text, got {repr(value)[:80]}")
 
 
-def _mount_request(row: SiteRow, scenario: Scenario) -> MountRequest:
+def _mount_request(row: SiteRow, scenario: Scenario, *, is_inverted: bool) -> MountRequest:
     keys = [key for key in site_files.NUMBER_COLUMNS if row.columns.get(key) not in (None, "")]
     values = parse_each(keys, lambda key: _parse_number(row.where, key, row.columns[key]), "sites")
     numbers = dict(zip(keys, values, strict=True))
@@ -512,6 +554,8 @@ def _mount_request(row: SiteRow, scenario: Scenario) -> MountRequest:
     if aim_m is not None and yaw_deg is not None:
         raise InputError(f"{row.where}: yaw_deg", f"the row has yaw_deg = {yaw_deg:g} and an aim", "Use one of them.")
     roll_deg = numbers.get("roll_deg", scenario.sites.roll_deg)
+    if is_inverted:
+        roll_deg = wrap_deg(roll_deg + 180.0)
     return MountRequest(numbers["x_m"], numbers["y_m"], heights_m, yaw_deg, pitch_deg, roll_deg, aim_m, ground_m)
 
 

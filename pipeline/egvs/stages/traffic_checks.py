@@ -82,7 +82,7 @@ def check_sumo_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         return  # check_times reports it
     errors = ErrorCollector()
     for path in demand.all():
-        if path.is_file() and not network.is_osm(path):
+        if path.is_file():
             errors.attempt("traffic", partial(user_files.check_copyable, path))
     if not errors.findings:
         errors.attempt("traffic", partial(user_files.check_demand_size, demand, *timing.simulated_s))
@@ -182,23 +182,6 @@ def check_internal_edges(inputs: CheckInputs) -> Iterator[Diagnostic]:
     if path is not None and roads is not None and roads.lacks_internal_edges:
         finding = Diagnostic.of("traffic", network.no_internal_edges_error(path, path))
         yield replace(finding, is_error=not scenario.traffic.is_finished)
-
-
-@_for_each_period
-def warn_map_as_network(inputs: CheckInputs) -> Iterator[Diagnostic]:
-    """Warn about a network that is an OpenStreetMap file."""
-    scenario = inputs.scenario
-    try:
-        path = sumo_folder.network_path(scenario)
-        is_map = path is not None and network.is_osm(path)
-    except InputError:
-        return  # check_times or the checks of the scene report it
-    if path is not None and is_map and not scenario.traffic.is_finished:
-        problem = (
-            f"{path.name} is a map: traffic is taken to drive on the right, and turns are not compared with the map's"
-        )
-        hint = f"Make the network with egvs new NAME --from {path.name}, and use its network.net.xml."
-        yield Diagnostic("map as network", sumo_folder.traffic_location(scenario), problem, hint)
 
 
 @_for_each_period

@@ -11,6 +11,7 @@ sumolib's reader is not used: it accepts any XML, entities included, and a damag
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.core.polygons import PairCount, check_corners, check_edge_pairs
-from egvs.formats import xml
+from egvs.formats import osm, xml
 from egvs.scenario.fields import parse_coordinate_m
 from egvs.traffic.signal_clock import SignalClock
 
@@ -53,8 +54,10 @@ ROAD_VCLASSES = (
 """A lane that admits one of these vClasses is carriageway."""
 
 _PEDESTRIAN = "pedestrian"
-_OSM_SUFFIXES = (".osm", ".osm.xml", ".osm.pbf")
+
+_MAP_ROOTS = ("osm", "OpenDRIVE")  # of OpenStreetMap and Lanelet2, and of OpenDRIVE
 _HINT = "Use a network that netconvert wrote."
+_MAX_PHASE_S = 1e9
 # pairs of their edges are far below any limit
 _FEW_POINTS = 200
 
@@ -196,8 +199,9 @@ class Edge:
 
     @property
     def seconds(self) -> float:
-        """Travel time on the fastest lane, at the speed limit."""
-        return self.lanes[0].length_m / max(lane.speed_m_s for lane in self.lanes)
+        """Travel time on the fastest lane, at the speed limit; infinite where that is 0."""
+        speed_m_s = max(lane.speed_m_s for lane in self.lanes)
+        return self.lanes[0].length_m / speed_m_s if speed_m_s > 0 else math.inf
 
     def lanes_for(self, vclass: str) -> int:
         """Return the number of lanes that a vClass may use."""
@@ -218,6 +222,8 @@ class Connection:
         SUMO's code ("s", "l", "R" ...); may be empty.
     via
         First lane inside the junction; may be empty.
+    signal
+        Id of the signal that governs it; may be empty.
     """
 
     source: int
@@ -227,6 +233,7 @@ class Connection:
     direction: str
     permission: Permission
     via: str
+    signal: str = ""
 
 
 @dataclass(frozen=True)
@@ -334,6 +341,15 @@ class Network:
     def edges(self) -> tuple[Edge, ...]:
         """Roads: edges without a function."""
         return tuple(edge for edge in self.all_edges if not edge.function)
+
+    @cached_property
+    def signal_groups(self) -> dict[str, frozenset[str]]:
+        """Nodes of each signal that governs several, by its id: one junction on the ground."""
+        nodes: dict[str, set[str]] = {}
+        for connection in self.connections:
+            if connection.signal:
+                nodes.setdefault(connection.signal, set()).add(self.edges[connection.source].to_node)
+        return {signal: frozenset(governed) for signal, governed in nodes.items() if len(governed) > 1}
 
     @cached_property
     def has_heights(self) -> bool:
@@ -481,7 +497,18 @@ class _Phase(NamedTuple):
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, str]) -> _Phase:
-        return cls(float(attributes.get("maxDur", attributes["duration"])), attributes.get("state", ""))
+        duration_s = parse_phase_s("duration", attributes["duration"])
+        if "maxDur" in attributes:
+            duration_s = parse_phase_s("maxDur", attributes["maxDur"])
+        return cls(duration_s, attributes.get("state", ""))
+
+
+def parse_phase_s(key: str, text: str) -> float:
+    """Return a duration of a phase of a signal; ValueError where SUMO would reject it."""
+    value = float(text)
+    if not 0.0 <= value <= _MAX_PHASE_S or (key == "duration" and value == 0.0):
+        raise ValueError(f"{key} = {text[:80]!r}: expected seconds, above 0")
+    return value
 
 
 def _longest_reds(phases: Sequence[_Phase]) -> dict[int, float]:
@@ -571,8 +598,11 @@ def _parse_lane(lane: Element, pairs: PairCount) -> Lane:
     width_m = float(lane.attrib["width"]) if "width" in lane.attrib else None
     length_m = float(lane.get("length", 0))
     speed_m_s = float(lane.get("speed", DEFAULT_SPEED_M_S))
+    if not (length_m >= 0 and speed_m_s >= 0):
+        raise ValueError(f"lane {lane.get('id', '')!r} has the length {length_m} and the speed {speed_m_s}")
     where = f"{pairs.file}: lane {lane.get('id', '')}"
-    permission = Permission.from_attributes(lane.attrib)
+    # a speed limit of 0 closes a lane
+    permission = Permission.from_attributes(lane.attrib if speed_m_s > 0 else {"disallow": "all"})
     return Lane(lane.attrib["shape"], where, width_m, length_m, permission, speed_m_s, pairs=pairs)
 
 
@@ -602,7 +632,8 @@ def _parse_connections(
             raise InputError(path, f"a <connection> from {start!r} refers to a lane that does not exist", _HINT)
         permission = Permission.from_attributes(connection)
         direction = connection.get("dir", "")
-        yield Connection(source, source_lane, target, target_lane, direction, permission, connection.get("via", ""))
+        via, signal = connection.get("via", ""), connection.get("tl", "")
+        yield Connection(source, source_lane, target, target_lane, direction, permission, via, signal)
 
 
 def _point(text: str) -> tuple[float, float]:
@@ -610,14 +641,22 @@ def _point(text: str) -> tuple[float, float]:
     return parse_coordinate_m(x), parse_coordinate_m(y)
 
 
-def is_osm(path: Path) -> bool:
-    """Whether a network file is an OpenStreetMap map, by its name."""
-    return path.name.removesuffix(".gz").endswith(_OSM_SUFFIXES)
+def check_is_no_map(path: Path) -> None:
+    """Raise an InputError for a map of a format that ``egvs new`` makes networks of."""
+    is_map = osm.is_pbf(path)
+    if not is_map:
+        try:
+            is_map = xml.read_root_tag(path) in _MAP_ROOTS
+        except InputError:
+            return  # whoever reads the network reports it
+    if is_map:
+        hint = f"Run egvs new NAME --from {path.name}, which makes a scenario with a network of it."
+        raise InputError(path, "expected a SUMO network, got a map", hint)
 
 
 def may_have_slopes(path: Path) -> bool:
-    """Whether a SUMO network has a shape with heights, without parsing it; False for OpenStreetMap maps."""
-    if is_osm(path) or not path.is_file():
+    """Whether a SUMO network has a shape with heights, without parsing it."""
+    if not path.is_file():
         return False
     return any(_SHAPE_WITH_HEIGHT.search(shape) is not None for shape in xml.scan_attribute_values(path, "shape"))
 

@@ -370,7 +370,7 @@ def _record_running(scenario: Scenario, host: str, port: int, extensions: Sequen
     inputs = sumo_folder.demand_files(scenario)
     timing = sumo_folder.make_timing(scenario.traffic, inputs.begin_s, where)
     net_file = inputs.files["net-file"][0]
-    cycle_s = 0.0 if network.is_osm(net_file) else network.read_net_xml(net_file).cycle_s
+    cycle_s = network.read_net_xml(net_file).cycle_s
     observations = TraciObservations()
     persons = any(extension.ADDS_TRAFFIC for extension in extensions)
     with sumo.connect_traci(host, port) as connection:

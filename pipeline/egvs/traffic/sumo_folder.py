@@ -1,4 +1,4 @@
-"""Prepare the folder that SUMO runs in; convert an OpenStreetMap map that a scenario names to a network.
+"""Prepare the folder that SUMO runs in.
 
 Steps of :func:`prepare_simulation`: find the files that a scenario, or the SUMO configuration that it names, takes its
 traffic from; check the times; copy the files; draw trips or sample routes if the scenario names none; add the route
@@ -10,34 +10,30 @@ compared exactly.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from egvs.core import files
-from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import number_of
-from egvs.formats import osm
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.traffic import demand, departures, network, signal_plans, sumo, town_trips, user_files
+from egvs.traffic import demand, departures, network, signal_plans, town_trips, user_files
 from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.vehicle_boxes import TrafficHook
 
 CONFIG_FILE, NETWORK_FILE, TRIPS_FILE, VTYPES_FILE = "run.sumocfg", "network.net.xml", "trips.rou.xml", "vtypes.add.xml"
 FCD_FILE, COLLISIONS_FILE, STOPS_FILE, LOG_FILE = "fcd.csv", "collisions.xml", "stops.xml", "sumo.log"
 STATISTICS_FILE, DRIVEN_ROUTES_FILE = "statistics.xml", "driven.rou.xml"
-EXTRA_ROUTES_FILE, PERSONS_FILE, MAP_FILE = "others.rou.xml", "persons.csv", "map.osm.xml"
+EXTRA_ROUTES_FILE, PERSONS_FILE = "others.rou.xml", "persons.csv"
 _RESERVED_NAMES = frozenset({
     CONFIG_FILE, TRIPS_FILE, VTYPES_FILE, FCD_FILE, COLLISIONS_FILE, STOPS_FILE, LOG_FILE, EXTRA_ROUTES_FILE,
-    PERSONS_FILE, MAP_FILE, STATISTICS_FILE, DRIVEN_ROUTES_FILE,
+    PERSONS_FILE, STATISTICS_FILE, DRIVEN_ROUTES_FILE,
 })  # fmt: skip
 
 OSM_SIGNALS = (
@@ -49,7 +45,6 @@ Signals stay green while vehicles arrive, and vehicles give way at the stop line
 town with 50 random vehicles for 1000 s: gridlock in two seeds of two with netconvert's defaults, in none with these.
 """
 
-_OSM_FLAGS = ("--geometry.remove", "--junctions.join", *OSM_SIGNALS, "--sidewalks.guess", "--crossings.guess")
 FCD_DIGITS = 8
 """Decimals of SUMO's outputs."""
 
@@ -142,9 +137,11 @@ def demand_files(scenario: Scenario) -> user_files.DemandFiles:
     """Return the inputs of a scenario's simulation; InputError if a file is missing."""
     traffic = scenario.traffic
     if traffic.sumocfg is not None:
-        return user_files.read_sumocfg(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
+        inputs = user_files.read_sumocfg(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
+        network.check_is_no_map(inputs.files["net-file"][0])
+        return inputs
     assert traffic.network is not None
-    files: dict[str, tuple[Path, ...]] = {"net-file": (scenario.find(traffic.network, "traffic.network"),)}
+    files: dict[str, tuple[Path, ...]] = {"net-file": (_find_network(scenario, traffic.network, "traffic.network"),)}
     if traffic.routes:
         files["route-files"] = tuple(scenario.find(name, "traffic.routes") for name in traffic.routes)
     return user_files.DemandFiles(files)
@@ -156,34 +153,29 @@ def network_path(scenario: Scenario) -> Path | None:
     """
     traffic = scenario.traffic
     if traffic.is_finished:
-        return None if traffic.roads is None else scenario.find(traffic.roads, "traffic.roads")
+        return None if traffic.roads is None else _find_network(scenario, traffic.roads, "traffic.roads")
     if traffic.network is not None:
-        return scenario.find(traffic.network, "traffic.network")
+        return _find_network(scenario, traffic.network, "traffic.network")
     if traffic.sumocfg is None:
         return None
     return user_files.sumocfg_network_path(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
 
 
+def _find_network(scenario: Scenario, name: str, key: str) -> Path:
+    path = scenario.find(name, key)
+    network.check_is_no_map(path)
+    return path
+
+
 def read_network(scenario: Scenario) -> network.Network | None:
-    """Read the network of a scenario, if any; an OpenStreetMap map is converted first."""
+    """Read the network of a scenario, if any."""
     path = network_path(scenario)
-    if path is None:
-        return None
-    if not network.is_osm(path):
-        return network.read_net_xml(path)
-    with files.temporary_folder() as folder:
-        convert_osm_to_network(path, folder / NETWORK_FILE)
-        return network.read_net_xml(folder / NETWORK_FILE, path)
+    return None if path is None else network.read_net_xml(path)
 
 
 def check_signal_plans(scenario: Scenario, path: Path) -> None:
-    """Raise an InputError if a plan of a signal does not fit the network in a file, which may be a map."""
-    if not network.is_osm(path):
-        signal_plans.check_plans(scenario, path, network.read_net_xml(path))
-        return
-    with files.temporary_folder() as folder:
-        convert_osm_to_network(path, folder / NETWORK_FILE)
-        signal_plans.check_plans(scenario, folder / NETWORK_FILE, network.read_net_xml(folder / NETWORK_FILE, path))
+    """Raise an InputError if a plan of a signal does not fit the network in a file."""
+    signal_plans.check_plans(scenario, path, network.read_net_xml(path))
 
 
 def copy_network(scenario: Scenario, folder: Path) -> None:
@@ -198,10 +190,7 @@ def copy_network(scenario: Scenario, folder: Path) -> None:
     if traffic.fcd is not None:
         inputs.append(scenario.find(traffic.fcd, "traffic.fcd"))
     _make_empty(folder, [*inputs, path])
-    if network.is_osm(path):
-        convert_osm_to_network(path, folder / NETWORK_FILE)
-    else:
-        user_files.copy_checked(path, folder / NETWORK_FILE)
+    user_files.copy_checked(path, folder / NETWORK_FILE)
 
 
 def rescue_s(teleport_s: float | None, roads: network.Network) -> float | None:
@@ -500,37 +489,6 @@ def _copy_files(
                 name = f"_{name}"
             used.add(name)
             names.append(name)
-            if option == "net-file" and network.is_osm(path):
-                convert_osm_to_network(path, folder / name)
-            else:
-                notes += user_files.copy_checked(path, folder / name)
+            notes += user_files.copy_checked(path, folder / name)
         copies[option] = ",".join(names)
     return copies, notes
-
-
-_CONVERSION_LOCK = threading.Lock()
-"""Held while a map is converted: another thread that needs the same network waits for it."""
-
-
-def convert_osm_to_network(path: Path, network_path: Path) -> None:
-    """Convert an OpenStreetMap map to a network, whose origin is at its south-west corner."""
-    with _CONVERSION_LOCK:
-        content = _convert_osm_once(path, hash_input(path))
-    with files.atomic_write(network_path) as partial:
-        partial.write_bytes(content)
-
-
-@lru_cache(maxsize=1)
-def _convert_osm_once(path: Path, _content: str) -> bytes:
-    """Return the network of a map; cached, for the check and the traffic."""
-    with files.temporary_folder() as folder:
-        if osm.is_pbf(path):  # netconvert reads XML only
-            osm.write_xml(path, folder / MAP_FILE)
-        else:
-            user_files.copy_checked(path, folder / MAP_FILE)
-        try:
-            sumo.run_netconvert(["--osm-files", MAP_FILE, *_OSM_FLAGS], folder, NETWORK_FILE)
-        except sumo.SumoInputError as error:
-            problem = "no network can be built from this map"
-            raise error.for_input(path, problem, "Download the map again, in full.") from None
-        return (folder / NETWORK_FILE).read_bytes()

@@ -7,18 +7,15 @@ how it converted longitude and latitude. If both are given, they are compared.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from egvs.core import files
-from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.formats.georeference import MAX_SCALE_ERROR, Georeference, WorldFrame, utm_epsg
 from egvs.scenario.model import Scenario
-from egvs.traffic import network, sumo, sumo_folder
+from egvs.traffic import network, sumo_folder
 from egvs.traffic.network import Location
 
 _TOLERANCE_M = 10.0
@@ -37,7 +34,7 @@ def scenario_georeference(scenario: Scenario) -> Georeference:
     Parameters
     ----------
     scenario
-        The scenario. If its network is an OpenStreetMap file, netconvert runs once.
+        The scenario.
 
     Raises
     ------
@@ -61,7 +58,7 @@ def world_frame_settings(scenario: Scenario) -> dict[str, Any]:
     Parameters
     ----------
     scenario
-        The scenario; its network is not converted.
+        The scenario.
 
     Returns
     -------
@@ -72,9 +69,7 @@ def world_frame_settings(scenario: Scenario) -> dict[str, Any]:
     if scenario.crs.epsg is not None:
         settings["crs"] = [scenario.crs.epsg, *scenario.crs.offset_m]
     path = _network_path(scenario)
-    if path is not None and network.is_osm(path):
-        settings |= {"map": hash_input(path), "sumo": sumo.sumo_version()}
-    elif path is not None:
+    if path is not None:
         location = network.read_location(path)
         if location is not None and location.projection not in _NO_PROJECTION:
             settings["location"] = [location.projection, *location.offset_m]
@@ -141,7 +136,7 @@ def network_location(scenario: Scenario) -> StatedLocation | None:
     path = _network_path(scenario)
     if path is None:
         return None
-    location = _read_network_location(path)
+    location = network.read_location(path)
     return None if location is None else StatedLocation(f"the network {path.name}", location)
 
 
@@ -179,23 +174,6 @@ def _network_path(scenario: Scenario) -> Path | None:
 def _network_frame(scenario: Scenario) -> WorldFrame | None:
     stated = network_location(scenario)
     return None if stated is None else network_world_frame(stated.location)
-
-
-def _read_network_location(path: Path) -> Location | None:
-    if not network.is_osm(path):
-        return network.read_location(path)
-    status = path.stat()
-    return _converted_location(path, status.st_mtime_ns, status.st_size)
-
-
-@lru_cache(maxsize=4)
-def _converted_location(path: Path, changed_ns: int, size: int) -> Location | None:
-    """The location that netconvert writes for a map; time and size of the file are part of the cache key."""
-    del changed_ns, size
-    with files.temporary_folder() as folder:
-        converted = folder / sumo_folder.NETWORK_FILE
-        sumo_folder.convert_osm_to_network(path, converted)
-        return network.read_location(converted)
 
 
 def _check_declared_scale(frame: WorldFrame, scenario: Scenario) -> None:

@@ -38,6 +38,8 @@ def test_shows_best_junction_warnings_and_attribution() -> None:
     assert "<b>where</b>: problem. <small>hint</small>" in html
     assert "© the mappers" in html
     assert html.count('class="plan"') == 2  # by gain, and by the share that is seen
+    for figure in re.findall(r"<svg.*?</svg>", html, re.DOTALL):
+        assert ('role="group"' in figure) == ("<a " in figure), "an image hides its links from screen readers"
 
 
 def test_shows_what_people_notice_where_it_is_known_for_all_junctions() -> None:

@@ -114,6 +114,6 @@ def test_says_that_a_validation_of_this_run_contradicts_the_ranking(
     assert "contradicts" not in run_egvs("run", mini, "--out", out)[1]
     monkeypatch.setattr(RankingCheck, "contradiction", "so")
     printed = run_egvs("run", mini, "--out", out, "--rehash")[1]  # the program seems unchanged
-    assert f"The validation contradicts the ranking: so. See {out / 'report.html'}#detected" in printed
+    assert "The validation contradicts the ranking: so." in printed
     other = run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[1]
     assert "contradicts" not in other  # the scores that were validated are others

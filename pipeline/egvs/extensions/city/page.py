@@ -118,7 +118,8 @@ def junction_map(
     named = junctions[:_MAX_NAMES]
     parts += maps.labels(frame, [(frame.x(j.x_m), frame.y(j.y_m), j.name, radius) for j in named])
     bar = ColourBar(low, high, label, even=True) if high > low else None
-    return frame.svg(parts, alt, bar=bar)
+    # an image cannot have links in it
+    return frame.svg(parts, alt, bar=bar).replace('role="img"', 'role="group"', 1)
 
 
 def map_frame(box: Box, prefix: str = "") -> MapFrame:

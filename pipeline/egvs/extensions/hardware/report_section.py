@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
 from egvs.extensions.hardware.files import ACCEPTANCE, FILES, SENSOR_DESIGN, SHEETS, design_digest
+from egvs.extensions.hardware.installation.sheet import describe_side_tilt
 from egvs.report.extension_sections import SectionWarning
 from egvs.results.labels import SCORE_LABELS
 from egvs.results.ranking import RankedSite
@@ -145,8 +146,10 @@ def _installation_row(name: str, values: Mapping[str, Any]) -> InstallationRow:
     tilt = "level"
     if pose["pitch_deg"]:
         tilt = f"{abs(pose['pitch_deg']):.1f}° {'up' if pose['pitch_deg'] > 0 else 'down'}"
-    if pose["roll_deg"]:
-        tilt += f", roll {abs(pose['roll_deg']):.1f}° {'left' if pose['roll_deg'] > 0 else 'right'} side up"
+    if Pose(**pose).is_inverted:
+        tilt += ", upside down"
+    if side := describe_side_tilt(Pose(**pose)):
+        tilt += f", roll {side}"
     return InstallationRow(
         name, values["sensor"], f"{values['height_m']:.2f}", f"{round(values['bearing_deg'], 1) % 360.0:.1f}°", tilt,
         tuple(f"{quantity} {limit}" for quantity, limit in values["tolerances"].items()), values["file"],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,6 +27,14 @@ _DESIGN_WIDTH = 190
 _REQUEST = DesignRequest("")
 _RECORDING = RecordingOptions()
 _LOW_DEG, _HIGH_DEG = ELEVATION_BOUNDS_DEG
+
+
+class Mount(StrEnum):
+    """How the sensor that recorded the sweeps is mounted."""
+
+    UPRIGHT = "upright"
+    INVERTED = "inverted"
+
 
 app = typer.Typer(no_args_is_help=True, help="Derive a sensor from its sweeps, or design one.")
 
@@ -92,6 +101,9 @@ def fit(
             " and where the ground plane is in that map.",
         ),
     ] = None,
+    mount: Annotated[
+        Mount, typer.Option(help="Whether the sensor stands or hangs upside down, with z of its frame downwards.")
+    ] = Mount.UPRIGHT,
     without_empty_sector: Annotated[
         bool,
         typer.Option(
@@ -115,7 +127,7 @@ def fit(
             raise InputError("--name", "no name is given", "Use --name north-mast.")
         output.check_name(name)
         map_options = _map_options(scenario, site)
-        options = fitting.FitOptions(ground, None if road is None else _sector(road))
+        options = fitting.FitOptions(ground, None if road is None else _sector(road), mount is Mount.INVERTED)
         folder = out or Path("sensors") / name
         files.check_writable(folder / output.SENSOR_FILE)
         steps = iter(range(1, 100))

@@ -155,6 +155,23 @@ def test_command_fits_yaw(yard_scenario: tuple[Path, Path], tmp_path: Path, run_
     assert "# Pose in the world of yard: x " in (out / "sensor.toml").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
+def test_command_fits_a_sensor_that_is_upside_down(tmp_path: Path, run_egvs: Any) -> None:
+    """Its sweep is that of an upright one, turned by 180 degrees about x: only the roll differs by these."""
+    truth = Truth(sigma_m=0.02, roll_deg=1.5, pitch_deg=-4.0)
+    ply.write(tmp_path / "sweep.ply", sweep_of(truth, coarse_sensor()) * (1.0, -1.0, -1.0))
+    arguments = ("sensor", "fit", tmp_path / "sweep.ply", "--name", "mast", "--out", tmp_path / "made")
+    code, _, error = run_egvs(*arguments)
+    assert code == 2
+    assert "expected a ground plane below the sensor, got none" in error and "with --mount inverted" in error
+    code, _, error = run_egvs(*arguments, "--mount", "inverted")
+    assert code == 0, error
+    (plane, *_) = json.loads((tmp_path / "made" / "fit.json").read_text(encoding="utf-8"))["ground_planes"]
+    assert plane["height_m"] == pytest.approx(truth.height_m, abs=0.02)
+    assert (plane["roll_deg"], plane["pitch_deg"]) == pytest.approx((1.5 - 180.0, -4.0), abs=0.1)
+    assert plane["normal"][2] < -0.99
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -317,7 +317,9 @@ def test_rejects_scan_that_cannot_be_one(installed: InstalledRun, run_egvs: Any,
     assert not (tmp_path / "out").exists()
 
 
-def write_street(folder: Path, *more: tuple[str, list[list[float]], float]) -> InstalledRun:
+def write_street(
+    folder: Path, *more: tuple[str, list[list[float]], float], sites: str = "pole_a,10,0,5,0,-5\n"
+) -> InstalledRun:
     """Make a run of a street whose two sides are alike, about the sensor at (10, 0, 5), with more houses."""
     scenario = write_installed_scenario(folder / "street")
     north = [[-20.0, 9.0], [60.0, 9.0], [60.0, 20.0], [-20.0, 20.0]]
@@ -329,7 +331,7 @@ def write_street(folder: Path, *more: tuple[str, list[list[float]], float]) -> I
         for name, ring, height in houses
     ]
     (scenario / "statics.geojson").write_text(collection(*features))
-    (scenario / "sites.csv").write_text("site,x_m,y_m,z_m,yaw_deg,pitch_deg\npole_a,10,0,5,0,-5\n")
+    (scenario / "sites.csv").write_text(f"site,x_m,y_m,z_m,yaw_deg,pitch_deg\n{sites}")
     egvs.run(egvs.load(scenario), folder / "run", jobs=1)
     (folder / "scans").mkdir()
     return InstalledRun(folder / "run", folder / "scans")
@@ -356,8 +358,29 @@ def test_rejects_scan_of_another_place(installed: InstalledRun) -> None:
     here, there = sites.site("pole_a"), sites.site("pole_b")
     sensor = sites.sensor(there)
     elsewhere = simulate_scan(sites.session.scene, sensor, there.pose, there.pose, sigma_m=0.02)
-    with pytest.raises(InputError, match=f"does not fit the static world around {here.name}"):
+    message = rf"scan0\.pcd: this scan was not taken at {here.name}; it fits {there.name}\. Use --site {there.name}"
+    with pytest.raises(InputError, match=message):
         accept_points(installed, elsewhere)
+
+
+def test_rejects_scan_that_fits_no_site(installed: InstalledRun) -> None:
+    sites = installed.sites
+    away = replace(sites.site("pole_a").pose, x_m=21.0, y_m=-20.0)
+    nowhere = simulate_scan(sites.session.scene, sites.sensor(sites.site("pole_a")), away, away, sigma_m=0.02)
+    with pytest.raises(InputError, match="does not fit the static world around pole_a"):
+        accept_points(installed, nowhere)
+
+
+def test_rejects_scan_of_another_pole_of_a_street_whose_poles_are_almost_alike(tmp_path: Path) -> None:
+    """Turned by 180 degrees, all but the kiosk fits here, too."""
+    start = ("start", [[-40, -9], [-30, -9], [-30, 9], [-40, 9]], 12.0)
+    kiosk = ("kiosk", [[22, 3], [27, 3], [27, 7], [22, 7]], 4.0)
+    street = write_street(tmp_path, start, kiosk, sites="pole_a,10,5,5,-90,-5\npole_b,30,-5,5,90,-5\n")
+    sites = street.sites
+    there = sites.site("pole_b")
+    scan = simulate_scan(sites.session.scene, sites.sensor(there), there.pose, there.pose, sigma_m=0.02)
+    with pytest.raises(InputError, match="this scan was not taken at pole_a; it fits pole_b"):
+        accept_points(street, scan)
 
 
 @pytest.mark.parametrize("option", ["--position", "--loss", "--vehicle-height"])

@@ -72,6 +72,18 @@ def test_grid_bearing_and_angles_are_those_of_the_pose(installed: InstalledRun) 
     assert data.rank.endswith("of 2 sites")
 
 
+def test_sensor_that_is_upside_down_is_described_as_it_hangs(installed: InstalledRun) -> None:
+    """Its field of view is that in the world: the beams of the sensor that point up point down."""
+    data = sheet.sheet_data(installed.sites, "pole_a")
+    low_deg, high_deg = data.sensor.elevation_span_deg
+    assert dict(data.orientation_rows)["Mount"] == "upright"
+    site = replace(data.site, pose=replace(data.pose, roll_deg=-178.5))
+    rows = dict(replace(data, site=site).orientation_rows)
+    assert rows["Mount"] == "upside down, cable outlet down"
+    assert rows["Roll"] == "1.5°, left side up"
+    assert f"{-high_deg:+.0f}° to {-low_deg:+.0f}°" in rows["Field of view"]
+
+
 def test_losses_name_the_direction() -> None:
     tilt = Tolerance(QUANTITIES[0], (-4.0, 0.0, 4.0), (1.62, 0.0, -0.7), 2.5, math.inf)
     assert sheet.describe_losses(tilt) == "4° down: -1.6, 4° up: +0.7 points"

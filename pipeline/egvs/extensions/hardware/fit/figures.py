@@ -169,7 +169,8 @@ def draw_ground(fit: SensorFit) -> Figure:
         line = np.array([-_VIEW_M, _VIEW_M])
         normal = fit.plane.normal
         axis.plot(line, -(fit.plane.height_m + normal[slope] * line) / normal[2], color="black", linewidth=0.8)
-        axis.set(xlabel=f"{name} (m)", ylabel="z (m)", xlim=(-_VIEW_M, _VIEW_M), ylim=(deepest, 2.0))
+        limits_m = (deepest, 2.0) if normal[2] > 0.0 else (-2.0, -deepest)
+        axis.set(xlabel=f"{name} (m)", ylabel="z (m)", xlim=(-_VIEW_M, _VIEW_M), ylim=limits_m)
     side.set_title(f"From the side: roll {fit.plane.roll_deg:.2f}, pitch {fit.plane.pitch_deg:.2f} degrees")
     across.set_title("Along the sensor's x axis")
     _bars(rates, [(b.from_m, b.to_m, b.rate) for b in fit.road_rates], 100.0, _GREEN, "from the road alone")

@@ -40,10 +40,13 @@ class FitOptions:
         Number of the ground plane, from 1.
     road_deg
         First and last azimuth of the road in the sensor's frame, counter-clockwise; None to find it.
+    is_inverted
+        Whether the sensor is upside down, so that z of its frame points downwards.
     """
 
     ground: int = 1
     road_deg: tuple[float, float] | None = None
+    is_inverted: bool = False
 
 
 @dataclass(frozen=True)
@@ -148,7 +151,7 @@ def fit_sensor(
     fine = [grid.range_m for grid, sweep in zip(grids, sweeps, strict=True) if not sweep.is_coarse]
 
     on_step("ground")
-    planes = _find_ground_planes(fine, angles, sweeps[0].name)
+    planes = _find_ground_planes(fine, angles, sweeps[0].name, is_inverted=options.is_inverted)
     if not 1 <= options.ground <= len(planes):
         raise InputError("--ground", f"expected a plane from 1 to {len(planes)}, got {options.ground}")
     plane = planes[options.ground - 1]
@@ -222,13 +225,17 @@ def with_map_pose(fit: SensorFit, scenario: Scenario, site_m: tuple[float, ...])
     return replace(fit, map_pose=fit_map_pose(points_m, fit.plane, world, site_m, scenario.name, fit.sweeps[0].name))
 
 
-def _find_ground_planes(grids: list[FloatArray], angles: BeamAngles, where: str) -> list[GroundPlane]:
+def _find_ground_planes(
+    grids: list[FloatArray], angles: BeamAngles, where: str, *, is_inverted: bool
+) -> list[GroundPlane]:
     points, normals = [], []
     for grid in grids:
         returned = np.isfinite(grid)
         points.append(empty_scan.points_of(grid, angles)[returned])
         normals.append(surface_normals(grid, angles)[returned])
-    return ground_plane.find_ground_planes(np.concatenate(points), np.concatenate(normals), where)
+    turn = np.array([1.0, -1.0, -1.0]) if is_inverted else np.ones(3)
+    planes = ground_plane.find_ground_planes(np.concatenate(points) * turn, np.concatenate(normals) * turn, where)
+    return [plane.upside_down() for plane in planes] if is_inverted else planes
 
 
 def _max_range_m(grids: list[FloatArray]) -> float:

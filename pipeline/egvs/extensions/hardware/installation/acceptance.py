@@ -50,6 +50,9 @@ _GOOD_STRUCTURE_SHARE = 0.6
 _MIRROR_MARGIN = 0.02
 """A scan whose mirror image agrees with so much more of the structure is mirrored; within it, nothing can tell."""
 _MIRROR = np.array([1.0, -1.0, 1.0])
+_OTHER_SITE_MARGIN = 0.05
+"""A scan that agrees with so much more of the structure around another pole was taken there."""
+_MAX_OTHER_POLES = 12
 _BLOCKED_BEAM_DEG = 0.3
 """An expected beam is stopped by the return of an obstacle that is at most this far beside it."""
 _SEARCH_POINTS = 6_000
@@ -338,7 +341,12 @@ def accept(
     scene = planned_sites.session.scene
     world = StaticWorld(scene, planned.pose)
     surfaces = StaticSurfaces(scene.world, planned.pose.position_m)
-    fit, comparison, others = _register(clouds, sensor, planned, surfaces, world, where, max_vehicle_height_m)
+    try:
+        fit, comparison, others = _register(clouds, sensor, planned, surfaces, world, where, max_vehicle_height_m)
+    except InputError:
+        _check_fits_no_other_site(clouds, planned_sites, planned, 0.0, where)
+        raise
+    _check_fits_no_other_site(clouds, planned_sites, planned, _structure(comparison), where)
     mirror_note = _check_not_mirrored(clouds, sensor, planned.pose, surfaces, world, where, _structure(comparison))
     progress("registered", 2, steps)
 
@@ -406,7 +414,7 @@ def _register(
         share = _structure(comparison) if _is_plausible(best, start) else 0.0
     if search is None or share < MIN_STRUCTURE_SHARE:
         mirrored = [cloud * _MIRROR for cloud in clouds]
-        if _mirror_share(mirrored, sensor, start, surfaces, world) > max(share, _GOOD_STRUCTURE_SHARE):
+        if _fitted_share(mirrored, sensor, start, surfaces, world) > max(share, _GOOD_STRUCTURE_SHARE):
             raise _mirrored_error(where)
         raise InputError(where, problem, hint)
     equally_good = [other.registration for other in search.equally_good]
@@ -453,7 +461,7 @@ def _check_not_mirrored(
     In a street whose sides are alike, a mirrored scan agrees with most of the structure.
     """
     mirrored = [cloud * _MIRROR for cloud in clouds]
-    gain = _mirror_share(mirrored, sensor, start, surfaces, world) - share
+    gain = _fitted_share(mirrored, sensor, start, surfaces, world) - share
     if gain > _MIRROR_MARGIN:
         raise _mirrored_error(where)
     if gain < -_MIRROR_MARGIN:
@@ -466,17 +474,47 @@ def _mirrored_error(where: str) -> InputError:
     return InputError(where, problem, "Export y to the left of x: azimuths count counter-clockwise from above.")
 
 
-def _mirror_share(
-    mirrored: Sequence[FloatArray], sensor: Sensor, start: Pose, surfaces: StaticSurfaces, world: StaticWorld
+def _check_fits_no_other_site(
+    clouds: Sequence[FloatArray], planned_sites: PlannedSites, planned: Site, share: float, where: str
+) -> None:
+    """Raise an InputError where scans fit the surroundings of another pole better, at any yaw.
+
+    Compared are the other poles of the plan, or of all candidates without a plan, the nearest first. ``share`` is that
+    of the structure around the planned site with which the scans agree.
+    """
+    scene = planned_sites.session.scene
+    best_name, best_share = "", max(share + _OTHER_SITE_MARGIN, _GOOD_STRUCTURE_SHARE)
+    for other in _sites_on_other_poles(planned_sites, planned):
+        surfaces = StaticSurfaces(scene.world, other.pose.position_m)
+        world = StaticWorld(scene, other.pose)
+        other_share = _fitted_share(clouds, planned_sites.sensor(other), other.pose, surfaces, world)
+        if other_share > best_share:
+            best_name, best_share = other.name, other_share
+    if best_name:
+        problem = f"this scan was not taken at {planned.name}; it fits {best_name}"
+        raise InputError(where, problem, f"Use --site {best_name}, or the scan of {planned.name}.")
+
+
+def _sites_on_other_poles(planned_sites: PlannedSites, planned: Site) -> list[Site]:
+    """Return one site of each other pole, the one nearest to the planned site in three dimensions."""
+    names = list(planned_sites.plan) or list(planned_sites.session.candidates)
+    sites = [planned_sites.site(name) for name in names]
+    by_distance = sorted(sites, key=lambda site: _distance_m(planned.pose, site.pose))
+    by_pole = {site.pole: site for site in reversed(by_distance) if site.pole != planned.pole}
+    return sorted(by_pole.values(), key=lambda site: _distance_m(planned.pose, site.pose))[:_MAX_OTHER_POLES]
+
+
+def _fitted_share(
+    clouds: Sequence[FloatArray], sensor: Sensor, start: Pose, surfaces: StaticSurfaces, world: StaticWorld
 ) -> float:
-    """Return how well mirrored scans agree with the structure of the static world; 0 if they cannot be registered."""
+    """Return how well scans agree with the structure of the static world at the best yaw; 0 if none is found."""
     try:
-        fit = registration.search_yaw(np.concatenate(list(mirrored)), surfaces, start).best
+        fit = registration.search_yaw(np.concatenate(list(clouds)), surfaces, start).best
     except InputError:
         return 0.0
     if not _is_plausible(fit, start):
         return 0.0
-    return _structure(scan_comparison.compare_scans(mirrored, sensor, fit.pose, world))
+    return _structure(scan_comparison.compare_scans(clouds, sensor, fit.pose, world))
 
 
 def _structure(comparison: ScanComparison) -> float:

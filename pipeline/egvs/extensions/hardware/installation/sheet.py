@@ -78,7 +78,7 @@ class SheetData:
     lon_lat_deg
         Longitude and latitude (WGS 84); None if the position on the Earth is unknown.
     convergence_deg
-        Meridian convergence; NaN if the position on the Earth is unknown.
+        Grid convergence (of meridians); NaN if the position on the Earth is unknown.
     zero_height_m
         Height of z = 0 of the world frame.
     tolerances
@@ -144,19 +144,21 @@ class SheetData:
         if self.lon_lat_deg is not None:
             rows += [
                 ("", f"{format_angle(self.true_bearing_deg)} from true north"),
-                ("Meridian convergence", f"{self.convergence_deg:+z.3f}° (grid north from true north)"),
+                ("Grid convergence", f"{self.convergence_deg:+z.3f}° (grid north from true north)"),
             ]
         tilt = f"{format_angle(abs(pose.pitch_deg))} {'up' if pose.pitch_deg > 0 else 'down'}"
         if pose.pitch_deg == 0:
             tilt = "0.0° (level)"
-        side = "0.0°"
-        if pose.roll_deg:
-            side = f"{format_angle(abs(pose.roll_deg))}, {'left' if pose.roll_deg > 0 else 'right'} side up"
-        return [*rows, ("Tilt of the front", tilt), ("Roll", side), ("Field of view", self._field_of_view)]
+        mount = "upside down, cable outlet down" if pose.is_inverted else "upright"
+        side = describe_side_tilt(pose) or "0.0°"
+        rows += [("Mount", mount), ("Tilt of the front", tilt), ("Roll", side)]
+        return [*rows, ("Field of view", self._field_of_view)]
 
     @property
     def _field_of_view(self) -> str:
         low, high = self.sensor.elevation_span_deg
+        if self.pose.is_inverted:
+            low, high = -high, -low
         width = "360°"
         if self.sensor.azimuth_span_deg is not None:
             first, last = self.sensor.azimuth_span_deg
@@ -173,6 +175,16 @@ def format_angle(value_deg: float) -> str:
     ('272.5°', '0.0°')
     """
     return f"{round(value_deg, 1) % 360.0:.1f}°"
+
+
+def describe_side_tilt(pose: Pose) -> str:
+    """Return the roll of a sensor from upright or upside down, and which of its sides is up as seen from behind it.
+
+    >>> describe_side_tilt(Pose(0, 0, 5, roll_deg=2.0)), describe_side_tilt(Pose(0, 0, 5, roll_deg=178.0))
+    ('2.0°, left side up', '2.0°, right side up')
+    """
+    tilt_deg = pose.side_tilt_deg
+    return f"{format_angle(abs(tilt_deg))}, {'left' if tilt_deg > 0 else 'right'} side up" if tilt_deg else ""
 
 
 def meridian_convergence_deg(frame: WorldFrame, xy_m: tuple[float, float]) -> float:
