@@ -139,6 +139,15 @@ def test_signal_plans_are_no_assumption_once_they_are_given(mini: Path) -> None:
     assert sections.describe_caveats(some, "ranking", plans=[given]) == sentence
 
 
+def test_existing_poles_are_no_assumption_and_missing_surroundings_are(mini: Path) -> None:
+    keys = ["assumed=['traffic (guessed)', 'positions of the poles']"]
+    for existing, poles in (("'all'", ()), ("['pole_a']", ("positions of the poles other than pole_a",))):
+        scenario = egvs.load(mini, [*keys, f"sites.existing_poles={existing}"])
+        assert sections.assumptions(scenario, ()) == ("traffic (guessed)", *poles)
+    bare = egvs.load(mini, [*keys, "statics.footprints=[]"])
+    assert sections.assumptions(bare, ())[2:] == ("surroundings (no building or tree is known)",)
+
+
 def test_says_that_losses_of_several_sensors_are_off_where_they_are(mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\na,10,12,5,VLP-16\nb,30.5,-12,5,VLP-32C\n")
     scenario = mini / "scenario.toml"

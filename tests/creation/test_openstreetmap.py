@@ -41,7 +41,15 @@ REAL = Path(__file__).parents[3] / "shared" / "real" / "bad_hersfeld.osm"
 Made = tuple[Path, new_scenario.NewScenario]
 
 
-NAMES = ["network.net.xml", "scenario.toml", "sites.csv", "statics.geojson", "zones.geojson"]
+NAMES = [
+    "counts.csv",
+    "network.net.xml",
+    "scenario.toml",
+    "signals.csv",
+    "sites.csv",
+    "statics.geojson",
+    "zones.geojson",
+]
 
 
 @pytest.fixture(scope="module")
@@ -259,13 +267,14 @@ def test_scenario_loads(made: Made) -> None:
         assert loaded.find(name, "test").is_file()
 
 
-def test_each_count_has_its_movement_as_a_comment(made: Made) -> None:
-    text = (made[0] / "scenario.toml").read_text(encoding="utf-8")
-    comments = re.findall(r"^    \{from_edge = .*\}, # (.*)$", text, re.MULTILINE)
-    assert len(comments) == len(set(comments)) == 12
-    assert "North Street (south), straight on" in comments
-    assert "North Street (south), left to East Street" in comments
-    assert "East Street (west), right to North Street" in comments
+def test_each_count_has_its_movement_in_words(made: Made) -> None:
+    header, *rows = (made[0] / "counts.csv").read_text(encoding="utf-8").splitlines()
+    assert header == "approach,turn,to,edge,from_edge,to_edge,count"
+    words = [row.split(",")[:3] for row in rows]
+    assert len(words) == 12
+    assert ["North Street (south)", "straight", "North Street"] in words
+    assert ["North Street (south)", "left", "East Street"] in words
+    assert ["East Street (west)", "right", "North Street"] in words
 
 
 def test_template_of_periods_can_be_used(made: Made, tmp_path: Path) -> None:
@@ -299,7 +308,7 @@ def test_special_characters_in_street_name_and_comments(tmp_path: Path) -> None:
     assert title == 'signalised junction of East A\\B = #1 "Straße" & more and North Street'
     assert loading.load(tmp_path / "named").description == f"S{title[1:]}"
     text = (tmp_path / "named" / "scenario.toml").read_text(encoding="utf-8")
-    assert re.search(r"^\] # assumed from the road classes", text, re.MULTILINE)
+    assert re.search(r"^counts = .* # assumed from the road classes", text, re.MULTILINE)
     assert len(re.findall(r"^\[(?:roi|traffic|statics|sites)\] +# \w", text, re.MULTILINE)) == 4
 
 
@@ -376,12 +385,13 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 def test_real_town(town: Made) -> None:
     folder, summary = town
-    assert "Meisebacher Straße" in summary.junction.title and summary.junction.signalised
+    assert "Seilerweg" in summary.junction.title and summary.junction.signalised
+    assert len(summary.junction.nodes) == 3  # they have one signal
     assert isinstance(summary.traffic, AssumedTraffic) and summary.traffic.assumed_per_h > 1000
-    assert summary.statics.counts.heights["building"] == {"levels": 1, "default": 262}
-    assert summary.statics.counts.objects["tree_trunk"] == 10
-    assert summary.statics.counts.dropped["out_of_range"] == {"barrier": 2, "building": 379, "pole": 18, "tree": 5}
-    assert loading.load(folder).roi.grid.shape == (360, 320, 20)
+    assert summary.statics.counts.heights["building"] == {"levels": 4, "default": 162}
+    assert summary.statics.counts.objects["tree_trunk"] == 0
+    assert summary.statics.counts.dropped["out_of_range"] == {"barrier": 5, "building": 476, "pole": 15, "tree": 15}
+    assert loading.load(folder).roi.grid.shape == (280, 440, 20)
     check_sites(folder, 12)
 
 
@@ -535,7 +545,7 @@ def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: 
         f"carries at least {traffic.assumed_per_h:,} vehicles an hour; {level} {100 * share:.0f} % is used"
     )
     text = (tmp_path / "out" / "scenario.toml").read_text(encoding="utf-8")
-    assert f"the network {traffic.summary}. Replace them by real counts" in text
+    assert f"the network {traffic.summary}. Replace its numbers by real counts" in text
     loaded = loading.load(tmp_path / "out")
     assert (loaded.traffic.junction_blocker_s, loaded.traffic.teleport_s) == (10.0, 120.0)
 

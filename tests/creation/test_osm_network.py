@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from egvs.creation.openstreetmap import street_network
-from egvs.formats import osm
 from egvs.formats.osm import Bounds, OsmExtract, Way
 
 CENTRE = (52.0, 10.0)
@@ -83,39 +82,3 @@ def test_drops_roads_connected_only_outside_circle() -> None:
     cut = street_network.cut_surroundings(extract(ways, {10: {"building": "yes"}}), CENTRE, 100)
     assert lines_m(cut) == {7: [(0, 0), (100, 0)], 10: ways[10]}
     assert street_network.cut_surroundings(extract(ways), CENTRE, 1000).ways.keys() >= {7, 8, 9}
-
-
-PROGRAMS = """<net version="1.20">
-  <edge id="in" from="a" to="j"><lane id="in_0" index="0" speed="9" length="9" shape="0,0 9,0"/></edge>
-  <tlLogic id="a" type="actuated" programID="0" offset="0">
-    <phase duration="42" maxDur="50" state="G"/><phase duration="3" state="y"/></tlLogic>
-  <tlLogic id="b" type="actuated" programID="0" offset="0">{}</tlLogic>
-</net>
-"""
-
-
-@pytest.mark.parametrize(("phases", "longest_s"), [(16, 272.0), (2, 45.0)])
-def test_longest_signal_program_counts_planned_durations(tmp_path: Path, phases: int, longest_s: float) -> None:
-    path = tmp_path / "n.net.xml"
-    path.write_text(PROGRAMS.format('<phase duration="17" minDur="5" maxDur="50" state="G"/>' * phases))
-    assert street_network.longest_program_s(path) == longest_s
-
-
-@pytest.mark.parametrize(("longest_s", "runs"), [(120.0, 1), (121.0, 2)])
-def test_signals_are_not_joined_if_a_program_gets_too_long(
-    monkeypatch: pytest.MonkeyPatch, longest_s: float, runs: int
-) -> None:
-    calls = []
-    convert = street_network.sumo.run_netconvert
-
-    def recorded(arguments: list[str], folder: Path, name: str) -> None:
-        calls.append(list(arguments))
-        convert(arguments, folder, name)
-
-    monkeypatch.setattr(street_network.sumo, "run_netconvert", recorded)
-    monkeypatch.setattr(street_network, "longest_program_s", lambda _: longest_s)
-    small = osm.read_osm(Path(__file__).parent / "data" / "small.osm")
-    flags = street_network.netconvert_flags(small, lefthand=False, walk=False)
-    street_network.build_network(small, Path("small.osm"), flags)
-    assert [("--tls.join" in arguments) for arguments in calls] == [True, False][:runs]
-    assert set(calls[0]) - set(calls[-1]) == ({"--tls.join"} if runs == 2 else set())

@@ -1,7 +1,8 @@
-"""docs/commands.md has every command of the program, each with a how-to that shows it."""
+"""The table of docs/commands.md has every command of the program, each with a how-to that shows it."""
 
 from __future__ import annotations
 
+import csv
 import re
 
 import typer
@@ -11,7 +12,12 @@ from egvs.cli.app import app
 from tests.docs.pages import DOCS, links, section
 
 PAGE = DOCS / "commands.md"
-_ROW = re.compile(r"^\| `egvs ([\w -]+)` \| (.+) \| (.+) \|$", re.MULTILINE)
+
+
+def table_rows() -> list[tuple[str, str]]:
+    """Return the name and the how-to of each command of the table."""
+    with (DOCS / "data" / "commands.csv").open(encoding="utf-8", newline="") as file:
+        return [(row["command"].strip("`").removeprefix("egvs "), row["how to"]) for row in csv.DictReader(file)]
 
 
 def program_commands() -> list[str]:
@@ -30,13 +36,12 @@ def program_commands() -> list[str]:
 
 
 def test_page_lists_every_command_in_the_order_of_the_help() -> None:
-    listed = [match[1] for match in _ROW.finditer(PAGE.read_text(encoding="utf-8"))]
-    assert listed == program_commands()
+    assert [name for name, _ in table_rows()] == program_commands()
 
 
 def test_how_to_shows_the_command() -> None:
     text = PAGE.read_text(encoding="utf-8")
-    for name, _, how_to in _ROW.findall(text):
+    for name, how_to in table_rows():
         targets = list(links(how_to))
         assert targets, name
         page, _, anchor = targets[0].partition("#")

@@ -1,4 +1,4 @@
-"""docs/validity.md agrees with the tables of the first study, and docs/data/README.md lists all data of the pages."""
+"""docs/validity.md agrees with the tables of the first study, and docs/data/files.csv lists all data of the pages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DATA = DOCS / "data"
 
 
 def test_list_of_data_has_each_file() -> None:
-    linked = set(links((DATA / "README.md").read_text(encoding="utf-8")))
+    linked = {link for name in ("README.md", "files.csv") for link in links((DATA / name).read_text(encoding="utf-8"))}
     files = {path.name for path in DATA.iterdir() if path.suffix in (".csv", ".json")}
     folders = {f"{path.name}/{table_files.INDEX}" for path in DATA.iterdir() if path.is_dir()}
     assert linked == files | folders

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -54,8 +55,9 @@ def test_tables_of_data_have_a_file_and_a_link(page: Path) -> None:
     """The site shows the table; readers of the file follow the link."""
     text = page.read_text(encoding="utf-8")
     for name in re.findall(r"<!-- data table (\S+) -->", text):
-        assert f"(data/{name}.csv)" in text
-        table = (page.parent / "data" / f"{name}.csv").read_text(encoding="utf-8")
+        file = DOCS / "data" / f"{name}.csv"
+        assert f"({Path(os.path.relpath(file, page.parent)).as_posix()})" in text
+        table = file.read_text(encoding="utf-8")
         assert not {target: reason for target in links(table) if (reason := problem(page, target))}
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from egvs.core.errors import InputError
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_names import ApproachNames
 from egvs.traffic.approaches import ApproachIndex
@@ -54,7 +55,7 @@ def test_directions_are_those_at_the_junction(tmp_path: Path) -> None:
             f'shape="15.1,{y_m} 30', f'shape="-20,{y_m} 30'
         )
     words = MovementNames(read(tmp_path, text), CENTER_M).describe("far", "up")
-    assert words == "High Street (west) from Side Street, left to an unnamed street"
+    assert words == "High Street (west), left to an unnamed street"
 
 
 SLIP_LANE = """<net version="1.20">
@@ -99,9 +100,19 @@ def test_right_turns_on_a_slip_lane_have_the_approach_of_their_edge(tmp_path: Pa
     assert alone.describe("in", "south") == "north-west, straight on"  # nothing else is known of its edge
 
 
-def test_side_streets_with_another_name_keep_their_approach(tmp_path: Path) -> None:
-    """The name of the street tells the two approaches of one edge apart."""
+def test_one_approach_has_one_name_and_aliases(tmp_path: Path) -> None:
+    """The name of a side street is another name of the approach, and a count without a turn is of all its turns."""
     text = SLIP_LANE.replace('id="slip" from="f" to="m"', 'id="slip" from="f" to="m" name="Mill Lane"')
+    text = text.replace('id="in" from="w" to="f"', 'id="in" from="w" to="f" name="Back Lane"')
+    text = text.replace('id="main" from="f" to="j"', 'id="main" from="f" to="j" name="High Street"')
     names = MovementNames(read(tmp_path, text), (0.0, 0.0), SLIP_FLOWS)
-    assert names.describe("in", "south") == "Mill Lane (north-west), straight on to an unnamed street"
-    assert names.describe("in", "east") == "west, straight on"
+    assert names.describe("in", "south") == "High Street (west), right to an unnamed street"
+    assert names.describe("in", None) == "High Street (west)"
+    index = ApproachIndex.of_flows(SLIP_FLOWS, names)
+    assert index.titles == ["High Street (west)"]
+    for street in ("High Street", "Mill Ln", "back lane", "Back Lane (west)"):
+        moves = index.find(street, "west", [], "counts.csv")
+        assert [move.flow.per_hour for move in moves] == [60.0, 40.0]
+    assert index.parse_approach("Back Lane (west)", "counts.csv") == ("High Street", "west")
+    with pytest.raises(InputError, match=r"no approach of the junction is called 'Ring'. The approaches are: High"):
+        index.find("Ring", "west", [], "counts.csv")

@@ -222,6 +222,23 @@ def test_movements_with_equal_green_share_an_entry():
     )
 
 
+def test_actuated_greens_are_at_most_the_longest():
+    """netconvert writes a duration of 82 s beside a limit of 50 s: no green is longer than the cycle."""
+    link = signals.Link(0, "north", "straight", "a", "", np.array([0.0, -1.0]))
+    phases = (signals.Phase(82.0, "G", 5.0, 50.0), signals.Phase(3.0, "y"), signals.Phase(5.0, "r"))
+    program = signals.Program("actuated", 0.0, phases)
+    signal = signals.Signal("c", ("c",), (0.0, 0.0), (link,), program)
+    region = Roi((-1.0, -1.0, 0.0), (2.0, 2.0, 1.0))
+    (plan,) = signal_descriptions.describe_signals([signal], region, {}, "assumed")
+    assert signal_descriptions.format_plan(plan) == (
+        "Signals at c (assumed): actuated, cycle up to 58 s; green up to 50 s north."
+    )
+    (fixed,) = signal_descriptions.describe_signals(
+        [replace(signal, program=replace(program, type="static"))], region, {}, "assumed"
+    )
+    assert signal_descriptions.format_plan(fixed) == "Signals at c (assumed): fixed, cycle 90 s; green 82 s north."
+
+
 def test_plan_of_the_network_is_described_only_in_the_region(crossing):
     found = signals.read_signals(crossing / "net.net.xml", network.read_net_xml(crossing / "net.net.xml"))
     here, elsewhere = (
@@ -248,6 +265,28 @@ def test_signal_of_several_junctions_knows_its_foes(tmp_path):
         assert not any(link.foes & green for link in signal.links if link.index in green)
 
 
+def test_approach_may_stay_red(crossing, tmp_path):
+    """Named without movements, in the scenario or in a table; a phase without any is red for all vehicles."""
+    closed = {
+        "phases": [NS | {"green": {"north": ["all"], "south": ["all"], "east": [], "west": []}}, EW | {"green": {}}]
+    }
+    (program,) = programs(crossing, {"c": closed}).values()
+    shutil.copy(crossing / "net.net.xml", tmp_path)
+    rows = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\na,east,,30\na,west,,30\nb,,,20\n"
+    (tmp_path / "p.csv").write_text(rows)
+    (from_table,) = programs(tmp_path, {"c": {"file": "p.csv"}}).values()
+    assert from_table == program
+    (signal,) = signals.read_signals(crossing / "net.net.xml", network.read_net_xml(crossing / "net.net.xml"))
+    closed_links = {
+        link.index for link in signal.links if link.side in ("east", "west") and link.movement != "crosswalk"
+    }
+    for phase in program.phases:
+        assert all(phase.state[index] == "r" for index in closed_links)
+    vehicles = [link.index for link in signal.links if link.movement != "crosswalk"]
+    assert {program.phases[3].state[index] for index in vehicles} == {"r"}
+    assert {letter for index, letter in enumerate(program.phases[3].state) if index not in vehicles} == {"G"}
+
+
 WRONG = [
     ({"x": {"phases": [NS, EW]}}, r"traffic.signals.x: the network has no such signal. Its signals are: High Street"),
     ({"c": {"phases": [NS, EW | {"green": {"nrth": ["all"]}}]}},
@@ -262,7 +301,7 @@ WRONG = [
     ({"c": {"phases": [NS | {"green": {"north": ["straight", "crossing"]}}]}},
      r"Mill Lane \(north\) straight and Mill Lane \(north\) crosswalk conflict"),
     ({"c": {"phases": [NS]}}, r"never green: High Street \(east\) right, High Street \(east\) straight.*\. "
-     r"A plan replaces all phases of the signal: add these movements to a phase\."),
+     r"Add these movements to a phase, or name their approach without movements if it stays red\."),
     ({"c": {"phases": [NS, EW], "cycle_s": 90}},
      r"cycle_s = 90: the phases with yellow and all-red add up to 60 s \(30, 3, 2, 20, 3, 2\). Use cycle_s = 60"),
     ({"c": {"phases": [NS, EW]}, "Mill Lane": {"phases": [NS, EW]}}, r"High Street / Mill Lane \(c\) has two plans"),
@@ -285,7 +324,6 @@ def test_rejects_plans_that_do_not_fit(crossing, plans, message):
         ({"phases": [NS | {"max_green_s": 40}]}, 'max_green_s has no effect with a fixed plan. Set type = "actuated"'),
         ({"phases": [NS | {"min_green_s": 40}], "type": "actuated"}, "expected min_green_s up to max_green_s"),
         ({"file": "a.add.xml", "yellow_s": 4}, "yellow_s has no effect with a <tlLogic> file"),
-        ({"phases": [NS | {"green": {}}]}, "at least 1"),
     ],
 )
 def test_rejects_contradictory_keys(plan, message):
@@ -366,6 +404,23 @@ def test_u_turn_has_one_printed_name(word):
     assert signal_plans._green_links(phase, signal, "plan") == {0}
     (plan,) = signal_descriptions.describe_signals([signal], Roi((-1.0, -1.0, 0.0), (2.0, 2.0, 1.0)), {}, "assumed")
     assert [row["movements"] for row in plan["rows"]] == [["U-turn"]]
+
+
+def test_approach_is_found_by_another_street_that_leads_to_it():
+    links = [
+        signals.Link(0, "High Street (west)", "straight", "a", "High Street", np.array([1.0, 0.0]), side="west",
+                     aliases=("Back Lane",)),
+        signals.Link(1, "Back Lane (north)", "left", "b", "Back Lane", np.array([0.0, -1.0]), side="north"),
+    ]  # fmt: skip
+    signal = signals.Signal("c", ("c",), (0.0, 0.0), tuple(links), signals.Program("static", 0.0, ()))
+    for name, approach in (
+        ("back ln. (west)", "High Street (west)"),
+        ("Back Lane", "Back Lane (north)"),
+        ("W", "High"),
+    ):
+        phase = SignalPhaseConfig.from_dict({"green": {name: ["all"]}, "green_s": 20})
+        (index,) = signal_plans._green_links(phase, signal, "plan")
+        assert links[index].approach.startswith(approach)
 
 
 def test_long_ids_are_shortened_and_still_accepted(tmp_path):

@@ -19,6 +19,9 @@ from egvs.traffic.network import Edge
 _ARM_M = 30.0
 """The direction of an arm is that of the point at this distance along it, seen from the middle of the junction."""
 
+_ARM_PER_SIZE = 3.0
+"""The same, per distance of the road's end from the middle of a large junction."""
+
 _SAME_ARM_DEG = 45.0
 """Two carriageways of the same name within this angle are one arm."""
 
@@ -111,5 +114,5 @@ def _bearing_deg(middle_m: XY, edge: Edge) -> float:
     ends_m = [math.dist(middle_m, points[index].tolist()) for index in (0, -1)]
     if ends_m[1] < ends_m[0]:
         points = points[::-1]
-    point = LineString(points).interpolate(_ARM_M)
+    point = LineString(points).interpolate(max(_ARM_M, _ARM_PER_SIZE * min(ends_m)))
     return float(np.degrees(np.arctan2(point.y - middle_m[1], point.x - middle_m[0])))

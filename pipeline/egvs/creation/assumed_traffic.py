@@ -21,7 +21,6 @@ from egvs.creation import junctions, scenario_files
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.capacity import Capacity, distribute_total, find_capacity, scale_flows
-from egvs.traffic.movements import MovementNames
 
 JUNCTION_BLOCKER_S, TELEPORT_S = 10.0, 120.0
 """What ends locks in new scenarios; the second is longer than any red phase and most waits to give way."""
@@ -125,13 +124,12 @@ class AssumedTraffic:
         yield _assumed_warning(assumed, self.per_h, scenario_file)
 
     def add_keys(self, table: Any, streets: Streets, junction: StreetJunction) -> None:
-        """Add the counts, and a template for periods, to ``[traffic]``."""
-        names = MovementNames(streets.network, junction.at_m, self.flows)
-        table.update({"counts": scenario_files.counts_array(self.flows, names)})
+        """Name the table of the counts, and add a template for periods, to ``[traffic]``."""
+        table.update({"counts": scenario_files.COUNTS_FILE})
         origin = f"assumed from the road classes ({self.assumed_per_h:,} vehicles an hour)"
         if self.level is None:
             origin = "divided among the movements by the road classes"
-        table["counts"].comment(f"{origin}; the network {self.summary}. Replace them by real counts")
+        table["counts"].comment(f"{origin}; the network {self.summary}. Replace its numbers by real counts")
         for line in scenario_files.periods_template(self.flows[0]):
             table.add(tomlkit.comment(line))
 
@@ -157,10 +155,15 @@ class NoTraffic:
 
 
 def _assumed_warning(assumed: str, per_h: int, scenario_file: Path) -> str:
+    place = (
+        f"under [traffic] in {scenario_file}"
+        if not per_h
+        else f"in {scenario_file.parent / scenario_files.COUNTS_FILE}"
+    )
     return (
         f"{assumed} ({per_h:,} vehicles an hour); this affects the ranking."
-        f" Enter counted traffic under [traffic] in {scenario_file} before you rely on the ranking,"
-        " and remove its entry from assumed."
+        f" Enter counted traffic {place} before you rely on the ranking,"
+        f" and remove its entry from assumed in {scenario_file.name}."
     )
 
 

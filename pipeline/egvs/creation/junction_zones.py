@@ -105,11 +105,10 @@ def _rounded(coordinates: Any) -> Any:
 
 
 def _conflict_area(streets: Streets, junction: StreetJunction) -> BaseGeometry:
-    ring_edges = () if junction.ring is None else junction.ring.edges
     parts = []
     for edge in streets.network.all_edges:
-        is_inside = edge.function == "internal" and _node_of(edge) in junction.nodes
-        if (is_inside or edge.id in ring_edges) and edge.id in streets.areas:
+        ends = [_node_of(edge)] if edge.function == "internal" else [edge.from_node, edge.to_node]
+        if set(junction.nodes).issuperset(ends) and edge.id in streets.areas:
             parts.append(streets.areas[edge.id])
     return shapely.union_all(parts)
 

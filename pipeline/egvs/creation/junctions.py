@@ -112,9 +112,9 @@ class StreetJunction:
     Attributes
     ----------
     id
-        SUMO's id; that of a roundabout contains the ids of its nodes.
+        SUMO's id; that of a roundabout contains the ids of its nodes, that of several nodes with one signal is its id.
     at_m
-        x, y of the junction's node, or of the middle of a roundabout.
+        x, y of the junction's node, or of the middle of a roundabout or of several nodes.
     area
         Outline, seen from above.
     lanes_in
@@ -127,6 +127,8 @@ class StreetJunction:
         Names of the streets that meet there, sorted.
     ring
         The roundabout; None for any other junction.
+    members
+        SUMO's ids of its nodes where one signal governs several; otherwise empty.
     """
 
     id: str
@@ -137,11 +139,14 @@ class StreetJunction:
     signalised: bool
     names: tuple[str, ...]
     ring: Ring | None = None
+    members: tuple[str, ...] = ()
 
     @property
     def nodes(self) -> tuple[str, ...]:
         """SUMO's ids of its nodes."""
-        return (self.id,) if self.ring is None else self.ring.nodes
+        if self.ring is not None:
+            return self.ring.nodes
+        return self.members or (self.id,)
 
     @property
     def is_crossing(self) -> bool:
@@ -304,7 +309,7 @@ def read_streets(path: Path) -> Streets:
             roads_at_node.setdefault(node_id, []).append(road)
 
     nodes = [node for node in network.junctions if node.incoming_lanes and node.type not in ("internal", "dead_end")]
-    junctions = [_make_junction(node, roads_at_node.get(node.id, []), lanes_for_vehicles) for node in nodes]
+    junctions = [_make_junction([node], roads_at_node.get(node.id, []), lanes_for_vehicles) for node in nodes]
 
     by_node = {junction.id: junction for junction in junctions}
     large_rings = []
@@ -315,6 +320,14 @@ def read_streets(path: Path) -> Streets:
         on_ring = [by_node[node] for node in ring.nodes if node in by_node]
         junctions = [junction for junction in junctions if junction.id not in ring.nodes]
         junctions.append(_make_roundabout(ring, on_ring, roads_at_node))
+    for signal, governed in network.signal_groups.items():
+        members = [node for node in nodes if node.id in governed]
+        roads = {road.id: road for node in members for road in roads_at_node.get(node.id, [])}
+        joined = _make_junction(members, list(roads.values()), lanes_for_vehicles, signal)
+        west_m, south_m, east_m, north_m = joined.area.bounds
+        others = {junction.id for junction in junctions} - {node for ring in large_rings for node in ring.nodes}
+        if governed <= others and max(east_m - west_m, north_m - south_m) <= ROI_MAX_M:
+            junctions = [junction for junction in junctions if junction.id not in governed] + [joined]
     return Streets(network, areas, tuple(junctions), tuple(large_rings))
 
 
@@ -329,24 +342,38 @@ def _lane_area(edge: Edge) -> BaseGeometry:
     return shapely.union_all(strips)
 
 
-def _make_junction(node: road_network.Junction, roads: Sequence[Edge], lanes_for_vehicles: Set[str]) -> StreetJunction:
-    """Make a junction from a node of the network and the roads that meet there."""
-    corners_m = node.shape_m[:, :2]
-    area = Point(node.at_m).buffer(1.0)
-    if len(corners_m) >= 3:
-        area = shapely.make_valid(Polygon(corners_m))
+def _make_junction(
+    nodes: Sequence[road_network.Junction], roads: Sequence[Edge], lanes_for_vehicles: Set[str], signal: str = ""
+) -> StreetJunction:
+    """Make a junction from nodes of the network and the roads that meet there; several nodes have one signal."""
+    ids = tuple(node.id for node in nodes)
+    middle = np.mean([node.at_m for node in nodes], axis=0).tolist()
+    at_m = (middle[0], middle[1])
+    area = shapely.union_all([_node_area(node) for node in nodes])
+    if signal:
+        area = area.convex_hull
 
-    car_roads = [road for road in roads if road.lanes_for(CAR)]
+    inside = {road.id for road in roads if road.from_node in ids and road.to_node in ids and len(ids) > 1}
+    entering = [lane for node in nodes for lane in node.incoming_lanes if lane.rpartition("_")[0] not in inside]
+    car_roads = [road for road in roads if road.lanes_for(CAR) and road.id not in inside]
     names = {html.unescape(road.name) for road in car_roads or roads if road.name}  # netconvert escapes names twice
     return StreetJunction(
-        node.id,
-        node.at_m,
+        signal or ids[0],
+        at_m,
         area,
-        lanes_in=sum(lane in lanes_for_vehicles for lane in node.incoming_lanes),
-        arms=len(arms.group_arms((node.id,), node.at_m, car_roads)),
-        signalised=node.type.startswith("traffic_light"),
+        lanes_in=sum(lane in lanes_for_vehicles for lane in entering),
+        arms=len(arms.group_arms(ids, at_m, car_roads)),
+        signalised=any(node.type.startswith("traffic_light") for node in nodes),
         names=tuple(sorted(names)),
+        members=ids if signal else (),
     )
+
+
+def _node_area(node: road_network.Junction) -> BaseGeometry:
+    corners_m = node.shape_m[:, :2]
+    if len(corners_m) >= 3:
+        return shapely.make_valid(Polygon(corners_m))
+    return Point(node.at_m).buffer(1.0)
 
 
 def _make_roundabout(
@@ -552,7 +579,8 @@ def _approaches(streets: Streets, junction: StreetJunction, window: BaseGeometry
 
 def _arm_areas(streets: Streets, junction: StreetJunction) -> list[BaseGeometry]:
     """Return the carriageway of each arm of a junction, as far as the next node."""
-    roads = [road for road in streets.network.edges if not set(_ends(road)).isdisjoint(junction.nodes)]
+    nodes = set(junction.nodes)
+    roads = [road for road in streets.network.edges if len(nodes.intersection(_ends(road))) == 1]
     if junction.ring is not None:
         grouped = roundabouts.ring_arms(junction.ring, roads)
     else:

@@ -9,6 +9,8 @@ flows, and find how much of them the network carries; write
     statics.geojson    footprints with heights, and import counts        (statics)
     sites.csv          candidate sites                                   (scan, score)
     zones.geojson      crosswalks, stop lines, approaches                (score)
+    counts.csv         movements with assumed numbers, to be overwritten (traffic)
+    signals.csv        the assumed plan of the signal, to be overwritten (traffic)
     scenario.toml      the scenario that names them
 
 and, where the maps have meshes, one PLY file for each kind of object.
@@ -30,8 +32,10 @@ import numpy as np
 import tomlkit
 from shapely.geometry.base import BaseGeometry
 
+from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import by_number, number_of
 from egvs.creation import (
     assumed_traffic,
@@ -43,7 +47,7 @@ from egvs.creation import (
     static_objects,
 )
 from egvs.creation.alignment import PointPair, check_used, make_alignment
-from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, NoTraffic
+from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic, NoTraffic
 from egvs.creation.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
 from egvs.creation.driving_side import requested_left
 from egvs.creation.junction_zones import Zone
@@ -51,6 +55,7 @@ from egvs.creation.junctions import JunctionRegion, KerbsidePole, StreetJunction
 from egvs.creation.map_parts import (
     DECK_BASE_M,
     DEFAULT_BUILDING_M,
+    OBJECT_KIND,
     OUT_OF_RANGE,
     ImportCounts,
     MapContext,
@@ -63,8 +68,10 @@ from egvs.creation.openstreetmap import ATTRIBUTION
 from egvs.creation.plain_network import NETWORK_FILE
 from egvs.creation.road_source import NetworkRoads, RoadSource
 from egvs.creation.scenario_files import (
+    COUNTS_FILE,
     PITCHES_DEG,
     SENSOR,
+    SIGNALS_FILE,
     SITES_FILE,
     STATICS_FILE,
     TERRAIN_FILE,
@@ -79,10 +86,13 @@ from egvs.creation.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.creation.terrain.relief import Relief, ground_surface
 from egvs.formats.archives import unpack_archives
 from egvs.scenario.loading import load
-from egvs.scenario.model import SCENARIO_FILE
+from egvs.scenario.model import NO_SURROUNDINGS, POLE_POSITIONS, SCENARIO_FILE
 from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
 from egvs.sensors.sensor import CATALOGUE
+from egvs.traffic.assumed_plans import assumed_plan, is_assumed
+from egvs.traffic.movements import MovementNames
+from egvs.traffic.signals import Signal, read_signals
 from egvs.traffic.sumo import SumoInputError
 from egvs.world.static_world import build_world
 from egvs.world.terrain import TerrainSurface
@@ -341,8 +351,8 @@ class _Draft:
         The static objects.
     roi, relief, zones, poles
         The region of interest, its relief, its zones, and the locations for poles.
-    plan, traffic
-        What the recordings give to the scenario, and its vehicles.
+    plan, traffic, signal
+        What the recordings give to the scenario, its vehicles, and the signal of the junction if its plan is assumed.
     notes
         What to know before trusting the scenario.
     """
@@ -374,6 +384,7 @@ class _Draft:
     poles: Sequence[KerbsidePole] = field(init=False)
     plan: RecordingPlan = field(init=False)
     traffic: ScenarioTraffic = field(init=False)
+    signal: Signal | None = None
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -436,6 +447,53 @@ def create_scenario(
         _plan_traffic(draft)
         draft.notes = [unpacked.user_text(note) for note in draft.notes]
         return _write_scenario(draft)
+
+
+@dataclass(frozen=True)
+class ListedJunction:
+    """A junction of a map: its description, arms and incoming lanes, signals, and the value of ``--at`` there."""
+
+    title: str
+    arms: int
+    lanes_in: int
+    signalised: bool
+    at: str
+
+
+def list_junctions(
+    maps: Sequence[str | Path], options: NewScenarioOptions | None = None, progress: ProgressCallback = no_progress
+) -> list[ListedJunction]:
+    """Return the junctions of a road map of which a scenario can be made, the largest first; nothing is written.
+
+    Parameters
+    ----------
+    maps
+        As for :func:`create_scenario`.
+    options
+        ``lefthand``, ``righthand`` and ``walk`` are used.
+    progress
+        Called at the beginning of each step.
+
+    Raises
+    ------
+    InputError
+        When a file is damaged or of an unknown format, or the road map has no drivable streets.
+    """
+    options = options or NewScenarioOptions()
+    with unpack_archives([Path(path) for path in maps]) as unpacked:
+        progress("opens the maps", 0, 0)
+        files = map_readers.open_maps(unpacked.paths)
+        progress("reads the roads", 0, 0)
+        road_options = RoadOptions(options.lefthand, options.walk, bool(files.terrain), None, options.righthand)
+        streets = _read_roads(files.roads, road_options).streets
+        progress("lists the junctions", 0, 0)
+        return [
+            ListedJunction(
+                junction.title, junction.arms, junction.lanes_in, junction.signalised,
+                _at_option(streets, junction.at_m),
+            )
+            for junction in junctions.distinct_crossings(streets)
+        ]  # fmt: skip
 
 
 def _open_files(
@@ -565,10 +623,22 @@ def _plan_traffic(draft: _Draft) -> None:
     if draft.options.signals:
         draft.junction = replace(draft.junction, signalised=True)
     draft.traffic = _choose_vehicles(draft)
+    draft.signal = _find_assumed_signal(draft)
     draft.notes += [*draft.plan.notes, *draft.traffic.notes]
     if draft.relief.other_levels:
         titles = ", ".join(draft.relief.other_levels)
         draft.notes.append(f"Lanes on another level cross the region of interest: {titles}.")
+
+
+def _find_assumed_signal(draft: _Draft) -> Signal | None:
+    """Return the signal of the junction if its plan is assumed, rather than recorded or a program of the user."""
+    if not draft.junction.signalised or draft.plan.is_finished or draft.plan.signal_notes:
+        return None
+    with files.temporary_folder() as folder:
+        files.write_text(folder / NETWORK_FILE, draft.plan.network)
+        signals = read_signals(folder / NETWORK_FILE, draft.roads.streets.network)
+    of_junction = [signal for signal in signals if not set(signal.nodes).isdisjoint(draft.junction.nodes)]
+    return of_junction[0] if len(of_junction) == 1 and is_assumed(of_junction[0]) else None
 
 
 def _choose_vehicles(draft: _Draft) -> ScenarioTraffic:
@@ -610,6 +680,7 @@ def _write_scenario(draft: _Draft) -> NewScenario:
         **meshes,
         **terrain_files,
         **draft.plan.files,
+        **_templates(draft),
         SCENARIO_FILE: _scenario_toml(draft, statics),
     }
     created: list[NewScenario] = []
@@ -622,6 +693,17 @@ def _write_scenario(draft: _Draft) -> NewScenario:
 
     scenario_files.publish_folder(draft.folder, contents.items(), check)
     return created[0]
+
+
+def _templates(draft: _Draft) -> dict[str, str]:
+    """Return tables with the assumed numbers, which the user overwrites: counts, and the plan of the signal."""
+    tables = {}
+    if isinstance(draft.traffic, AssumedTraffic):
+        names = MovementNames(draft.roads.streets.network, draft.junction.at_m, draft.traffic.flows)
+        tables[COUNTS_FILE] = scenario_files.counts_csv(draft.traffic.flows, names)
+    if draft.signal is not None:
+        tables[SIGNALS_FILE] = scenario_files.signals_csv(assumed_plan(draft.signal))
+    return tables
 
 
 def _summarise(draft: _Draft, traffic: ScenarioTraffic, n_solids: int) -> NewScenario:
@@ -921,6 +1003,10 @@ def _scenario_toml(draft: _Draft, statics: TomlTable) -> str:
     for note in draft.plan.signal_notes:
         document["traffic"].add(tomlkit.comment(f"{NETWORK_FILE}: {note}"))
     draft.traffic.add_keys(document["traffic"], draft.roads.streets, draft.junction)
+    if draft.signal is not None:
+        keys = {"file": SIGNALS_FILE, "type": "actuated"}
+        document["traffic"]["signals"] = {draft.signal.id: keys}
+        document["traffic"]["signals"][draft.signal.id]["file"].comment("assumed. Replace it by the real plan")
     return tomlkit.dumps(document)
 
 
@@ -938,7 +1024,15 @@ def _assumptions(draft: _Draft) -> list[str]:
     assumed = list(draft.traffic.assumptions)
     if draft.junction.signalised and not draft.plan.is_finished and not draft.plan.signal_notes:
         assumed.append(ASSUMED_PLANS)
-    return [*assumed, *draft.plan.assumptions, *assumed_sizes(draft.objects.counts), "positions of the poles"]
+    assumed += [*draft.plan.assumptions, *assumed_sizes(draft.objects.counts)]
+    kinds = {solid.kind for solid in draft.objects.solids} | {mesh.kind for mesh in draft.objects.meshes}
+    if not any(kind.startswith(_SURROUNDINGS) for kind in kinds):
+        assumed.append(NO_SURROUNDINGS)
+    return [*assumed, POLE_POSITIONS]
+
+
+_SURROUNDINGS = ("building", "roof", "tree", "vegetation", "mesh", OBJECT_KIND)
+"""Kinds of solids, or their beginnings, that can hide vehicles; a map without any probably has roads only."""
 
 
 def assumed_sizes(counts: ImportCounts) -> list[str]:

@@ -6,6 +6,8 @@ functions that make single tables of ``scenario.toml`` are also used for the jun
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
 import re
@@ -29,12 +31,15 @@ from egvs.creation.plain_network import NETWORK_FILE
 from egvs.scenario.fields import Name
 from egvs.scenario.model import RoiConfig
 from egvs.scenario.score_config import DEFAULT_SCORE, ScoreConfig
-from egvs.scenario.traffic_config import CountConfig, VehicleKind
+from egvs.scenario.signal_config import SignalConfig
+from egvs.scenario.traffic_config import COUNT_IDS, COUNT_NAMES, CountConfig, VehicleKind
 from egvs.sensors.sensor import CATALOGUE
+from egvs.traffic.approach_names import approach_name
+from egvs.traffic.directions import arrival_side
 from egvs.traffic.movements import MovementNames
 
 STATICS_FILE, SITES_FILE, TERRAIN_FILE = "statics.geojson", "sites.csv", "terrain.ply"
-ZONES_FILE = "zones.geojson"
+ZONES_FILE, COUNTS_FILE, SIGNALS_FILE = "zones.geojson", "counts.csv", "signals.csv"
 SENSOR = "VLP-32C"
 
 PITCHES_DEG: tuple[float | str, ...] = (0.0, -10.0, "aim")
@@ -220,6 +225,33 @@ def counts_array(flows: Sequence[CountConfig], names: MovementNames, comments: S
         rows.add_line(_count_row(flow), comment=movement)
     rows.add_line(indent="")
     return rows
+
+
+def counts_csv(flows: Sequence[CountConfig], names: MovementNames) -> str:
+    """Return a table of flows: their approach and turn for people, and their edges; the user overwrites the numbers."""
+    rows = []
+    for flow in flows:
+        movement = names.movement(flow.edge or flow.from_edge or "", flow.to_edge)
+        approach = approach_name(arrival_side(movement.heading), movement.street)
+        ids = (flow.edge or "", flow.from_edge or "", flow.to_edge or "")
+        rows.append((approach, movement.turn, movement.way_out, *ids, f"{flow.per_hour:.12g}"))
+    return _csv((*COUNT_NAMES, *COUNT_IDS, "count"), rows)
+
+
+def signals_csv(plan: SignalConfig) -> str:
+    """Return a table of the phases of a plan; the user overwrites it."""
+    rows: list[tuple[str, ...]] = []
+    for number, phase in enumerate(plan.phases, start=1):
+        for approach, movements in phase.green.items() or [("", ())]:
+            rows.append((str(number), approach, " ".join(movements), f"{phase.green_s:g}"))
+    return _csv(("phase", "approach", "movement", "green_s"), rows)
+
+
+def _csv(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([header, *rows])
+    return text.getvalue()
 
 
 def kinds_array(kinds: Sequence[VehicleKind], comments: Sequence[Sequence[str]]) -> Any:

@@ -24,7 +24,7 @@ from egvs.traffic.network import CAR, TURNAROUNDS, Permission
 
 MOST_LISTED = 5
 
-_PATCH_FILE = "turns.con.xml"
+_PATCH_FILE, _SIGNALS_FILE = "turns.con.xml", "signals.nod.xml"
 _LANE = re.compile(r'<lane id="([^"]*)"[^>]*>')
 _CHANGE = re.compile(r' change(?:Left|Right)="[^"]*"')
 
@@ -129,8 +129,9 @@ def patch_network(
     removed: Iterable[Connection],
     added: Iterable[Connection],
     flags: Sequence[str],
+    signals: Mapping[str, Collection[str]] | None = None,
 ) -> None:
-    """Let netconvert remove and add connections of a network.
+    """Let netconvert remove and add connections of a network, and signals.
 
     Parameters
     ----------
@@ -145,11 +146,22 @@ def patch_network(
         rejects the network.
     flags
         Further flags of netconvert.
+    signals
+        Nodes that get signals, by the id of the signal.
     """
     elements = [f"<delete {_attributes(connection)}/>" for connection in sorted(set(removed))]
     elements += [f"<connection {_attributes(connection)}/>" for connection in sorted(set(added))]
     files.write_text(folder / _PATCH_FILE, "\n".join(["<connections>", *elements, "</connections>", ""]))
-    sumo.run_netconvert(["-s", name, "-x", _PATCH_FILE, *flags], folder, patched)
+    arguments = ["-s", name, "-x", _PATCH_FILE, *flags]
+    if signals:
+        nodes = [
+            f'<node id={quoteattr(node)} type="traffic_light" tl={quoteattr(signal)}/>'
+            for signal, governed in signals.items()
+            for node in governed
+        ]
+        files.write_text(folder / _SIGNALS_FILE, "\n".join(["<nodes>", *nodes, "</nodes>", ""]))
+        arguments += ["-n", _SIGNALS_FILE]
+    sumo.run_netconvert(arguments, folder, patched)
     original = (folder / name).read_text(encoding="utf-8")
     text = (folder / patched).read_text(encoding="utf-8")
     files.write_text(folder / patched, _restore_lane_changes(original, text))

@@ -47,6 +47,7 @@ _SYNONYMS = {
 }  # fmt: skip
 
 _SUFFIXES = re.compile(r"(\.(pcd|ply|las|laz|csv|e57|bin|npz|json|txt))?(\.gz)?$", re.IGNORECASE)
+_LABEL_SUFFIXES = (".json", ".txt", ".csv")
 _NAME_HINT = "Name labels like their sweep: A.json or A.txt beside A.pcd."
 
 
@@ -158,7 +159,9 @@ def sweep_name(path: PurePath | str) -> str:
     return _SUFFIXES.sub("", PurePath(path).name, count=1)
 
 
-def read_labels(paths: Sequence[str | Path], options: LabelOptions | None = None) -> list[SweepLabels]:
+def read_labels(
+    paths: Sequence[str | Path], options: LabelOptions | None = None, sweeps: Sequence[Sweep] = ()
+) -> list[SweepLabels]:
     """Return the labels in some files, in their order.
 
     Parameters
@@ -167,6 +170,8 @@ def read_labels(paths: Sequence[str | Path], options: LabelOptions | None = None
         Files, or folders, of which all files count whose name is of a format of labels.
     options
         How they are read.
+    sweeps
+        The sweeps. A file of a folder that is named like one, as labels are, must be of a known format.
 
     Raises
     ------
@@ -174,11 +179,11 @@ def read_labels(paths: Sequence[str | Path], options: LabelOptions | None = None
         If a file is missing, damaged, of an unknown format, or has no possible boxes; if no file has a box.
     """
     labels: list[SweepLabels] = []
-    for path in list_files(paths, KIND):
+    for path in [*list_files(paths, KIND), *_named_like_labels(paths, sweeps)]:
         limits.checked_size(path, limits.FILE)
         reader = readers.find_reader(KIND, path)
         if reader is None:
-            problem = f"expected labels ({readers.describe_formats(KIND)}), got another file"
+            problem = f"expected labels ({readers.describe_formats(KIND)}), got another or a damaged file"
             raise InputError(path, problem, "Convert the labels, or leave the file out.")
         expected = "a module with a function read_labels(path, options)"
         module = cast(LabelFormat, readers.load_reader(reader, ("read_labels",), expected))
@@ -189,6 +194,23 @@ def read_labels(paths: Sequence[str | Path], options: LabelOptions | None = None
     if not labels:
         raise InputError("--labels", "expected labels, got none", _NAME_HINT)
     return labels
+
+
+def _named_like_labels(paths: Sequence[str | Path], sweeps: Sequence[Sweep]) -> list[Path]:
+    """Return the files of folders that are named like a sweep and have a suffix of labels, but not their content."""
+    files = {sweep.name.split(": ")[0] for sweep in sweeps}
+    names = {sweep_name(file) for file in files}
+    return [
+        file
+        for folder in map(Path, paths)
+        if folder.is_dir()
+        for file in sorted(folder.rglob("*"))
+        if file.name.lower().removesuffix(".gz").endswith(_LABEL_SUFFIXES)
+        and file.is_file()
+        and sweep_name(file) in names
+        and file.name not in files
+        and not _is_of_kinds(file, (KIND,))
+    ]
 
 
 def list_files(paths: Sequence[str | Path], *kinds: str) -> list[Path]:

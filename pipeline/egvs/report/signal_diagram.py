@@ -32,7 +32,7 @@ def signal_diagrams(plans: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, 
             continue
         cycle = f"Cycle {plan['cycle_s']:g} s"
         if plan["type"] != "fixed":
-            cycle += f", {plan['type']}: up to {plan['max_cycle_s']:g} s, drawn without extensions"
+            cycle = f"Cycle up to {plan['cycle_s']:g} s, {plan['type']}: drawn with the longest greens"
         cycle += f"; offset {plan['offset_s']:g} s; {plan['source']}."
         diagrams.append((plan_title(plan), cycle, stage_diagram(plan)))
     return diagrams

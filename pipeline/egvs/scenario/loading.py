@@ -8,6 +8,7 @@ Messages about invalid values name the key, the value, and what is expected.
 
 from __future__ import annotations
 
+import csv
 import difflib
 import json
 import os
@@ -22,11 +23,16 @@ from pydantic.fields import FieldInfo
 from egvs.core import files, reading
 from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
+from egvs.core.numbers import number_or_nan
 from egvs.scenario.fields import NAME_DESCRIPTION
 from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario, StaticsConfig
 from egvs.scenario.settings import changed_settings, flatten_settings
+from egvs.scenario.shipped import shipped_names, shipped_scenario
 from egvs.scenario.traffic_config import (
+    COUNT_IDS,
+    COUNT_NAMES,
     FINISHED_SOURCES,
+    MAX_PER_HOUR,
     TRAFFIC_SOURCES,
     TrafficConfig,
     keys_without_effect,
@@ -164,7 +170,8 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     Parameters
     ----------
     path
-        The folder, or its ``scenario.toml``.
+        The folder, or its ``scenario.toml``; the name of a scenario that comes with this program, if there is no such
+        folder.
     overrides
         ``"table.key=value"``, the value as in TOML; a word without quotes is a string.
 
@@ -183,6 +190,8 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     path = Path(path)
     files.check_utf8("the scenario", str(path.absolute()))
     overrides = tuple(overrides)
+    if path.name == os.fspath(path) and path.name in shipped_names() and not path.exists():
+        path = shipped_scenario(path.name)
     file = path / SCENARIO_FILE if path.is_dir() else path
     values = apply_overrides(_read_with_bases(file, ()), overrides)
     try:
@@ -284,7 +293,7 @@ def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
         raise InputError(where, f"expected a {SCENARIO_FILE}, got none", _suggest_scenario(where))
     if file.resolve() in extending:
         raise InputError(f"{file}: extends", "the scenario extends itself", "Extend a different scenario.")
-    values = reading.read_toml(file)
+    values = _with_count_tables(reading.read_toml(file), file)
     extends = values.get("extends", "")
     if not isinstance(extends, str):
         raise InputError(f"{file}: extends", f"expected the path of a scenario folder, got {extends!r}")
@@ -294,7 +303,49 @@ def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
     return _merge(_drop_replaced_keys(base, values), values)
 
 
-_SITE_SOURCE_KEYS = ("points", "only_free", "heights_m")
+def _with_count_tables(values: dict[str, Any], file: Path) -> dict[str, Any]:
+    """Return the values with the rows of tables in place of their names: ``counts = "counts.csv"``."""
+    traffic = values.get("traffic")
+    if not isinstance(traffic, dict):
+        return values
+    periods = traffic.get("periods")
+    for table in (traffic, *(periods if isinstance(periods, list) else ())):
+        if isinstance(table, dict) and isinstance(table.get("counts"), str):
+            table["counts"] = _read_counts(file.parent / table["counts"], f"{file}: traffic.counts")
+    return values
+
+
+def _read_counts(path: Path, where: str) -> list[dict[str, Any]]:
+    """Return the counts of a table as rows of ``traffic.counts``; columns with names are for people."""
+    if not path.is_file():
+        raise InputError(where, f"no such file: {path}", "Give the path of a CSV file, or counts in rows.")
+    with reading.translate_errors(path, "a table in UTF-8"):
+        text = path.read_text(encoding="utf-8-sig")
+    first = text.partition("\n")[0]
+    has_semicolons = first.count(";") > first.count(",")
+    rows = csv.DictReader(text.splitlines(), delimiter=";" if has_semicolons else ",")
+    unknown = [name for name in rows.fieldnames or () if name not in (*COUNT_IDS, *COUNT_NAMES, "count", "kind")]
+    if unknown or "count" not in (rows.fieldnames or ()):
+        problem = f"unknown column {unknown[0]!r}" if unknown else "the column 'count' is missing"
+        raise InputError(path, problem, f"Columns: {', '.join((*COUNT_NAMES, *COUNT_IDS))}, count, kind.")
+    counts = []
+    for number, row in enumerate(rows, start=2):
+        count: dict[str, Any] = {key: row[key] for key in (*COUNT_IDS, "kind") if row.get(key)}
+        if not any(row.values()):
+            continue
+        if not any(key in count for key in COUNT_IDS):
+            hint = "Keep the ids of the template; egvs new --counts FILE reads tables with names only."
+            raise InputError(f"{path}: line {number}", "expected from_edge and to_edge, or edge, got neither", hint)
+        number_text = row["count"] or ""
+        count["per_hour"] = number_or_nan(number_text.replace(",", ".") if has_semicolons else number_text)
+        if not 0 <= count["per_hour"] <= MAX_PER_HOUR:
+            problem = f"expected vehicles per hour, got {row['count']!r}"
+            raise InputError(f"{path}: line {number}: count", problem, "Use a number such as 120.")
+        counts.append(count)
+    return counts
+
+
+_SITE_SOURCE_KEYS = ("points", "only_free", "heights_m", "existing_poles")
 """Keys of ``[sites]`` that go with one source of sites; a new source does not take them over."""
 _POLYGON_KEYS = ("polygon_height_m", "polygon_types")
 """Keys of ``[statics]`` that go with ``polygons``."""
@@ -424,13 +475,21 @@ def _recorded_folder(run: Path) -> str:
 
 
 def _suggest_similar_scenario(folder: Path) -> str:
-    """Return a hint at a scenario beside a folder that does not exist, with a similar name."""
-    hint = f"Give a folder with a {SCENARIO_FILE}, or the file."
-    if not folder.parent.is_dir():
-        return hint
-    scenarios = {path.name: path for path in sorted(folder.parent.iterdir()) if (path / SCENARIO_FILE).is_file()}
+    """Return a hint at a scenario with a similar name, beside a missing folder or shipped, or at all shipped ones."""
+    scenarios = {name: Path(name) for name in shipped_names()}
+    hint = f"Give a folder with a {SCENARIO_FILE}, or the name of a shipped scenario: {', '.join(scenarios)}."
+    if folder.parent.is_dir():
+        paths = (path for path in folder.parent.iterdir() if (path / SCENARIO_FILE).is_file())
+        scenarios |= {path.name: path for path in sorted(paths)}
     similar = difflib.get_close_matches(folder.name, scenarios, 1)
     return f"Did you mean {scenarios[similar[0]]}?" if similar else hint
+
+
+def check_is_scenario(scenario: object) -> None:
+    """Raise an InputError for a path or another value in place of a scenario."""
+    if not isinstance(scenario, Scenario):
+        problem = f"expected the result of egvs.load, got {str(scenario)[:80]!r}"
+        raise InputError("scenario", problem, "Use egvs.load(FOLDER).")
 
 
 def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:

@@ -13,7 +13,7 @@ DEFAULT_MIN_GREEN_S = 5.0
 ASSUMED_PLANS = "signal plans"
 """Entry of the key ``assumed`` of a scenario whose signal plans netconvert has made."""
 
-Movements = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)]
+Movements = tuple[Annotated[str, Field(min_length=1)], ...]
 
 _PLAN_KEYS = ("all_red_s", "cycle_s", "phases", "type", "yellow_s")
 """Keys that a program in a SUMO file sets itself."""
@@ -23,10 +23,10 @@ class SignalPhaseConfig(StrictModel):
     """A phase of a signal plan: who has green, and for how long."""
 
     green: dict[str, Movements] = Field(
-        min_length=1,
         description="Movements with green by approach, e.g. { north = ['straight', 'right'] }. An approach is the"
         " compass direction that it comes from, its street, both ('Main Street (north)') or an edge; a movement is"
-        " left, straight, right, U-turn, crosswalk or all",
+        " left, straight, right, U-turn, crosswalk or all. {} is red for all vehicles; { north = [] } keeps an approach"
+        " red that is in no phase",
     )
     green_s: Positive = Field(description="Green time; with actuated signals, that without any detection")
     yellow_s: float | None = Field(None, ge=0, description="Yellow after this phase, instead of that of the plan")

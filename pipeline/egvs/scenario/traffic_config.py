@@ -45,6 +45,11 @@ class VehicleKind(StrictModel):
         return attributes
 
 
+COUNT_IDS, COUNT_NAMES = ("edge", "from_edge", "to_edge"), ("approach", "turn", "to")
+"""Columns of a table of counts: ids of edges, and names that are only for people."""
+
+MAX_PER_HOUR = 1e5
+
 EdgeId = Annotated[str, Field(min_length=1)]
 
 
@@ -56,7 +61,7 @@ class CountConfig(StrictModel):
     to_edge: EdgeId | None = Field(
         None, description="Id of the edge that they drove to, at the next junction or beyond"
     )
-    per_hour: float = Field(ge=0, le=1e5, description="Vehicles per hour")
+    per_hour: float = Field(ge=0, le=MAX_PER_HOUR, description="Vehicles per hour")
     kind: str = Field("", description="Kind of vehicle that was counted. By default the whole fleet")
 
     @model_validator(mode="after")
@@ -80,6 +85,14 @@ _PERIOD_SOURCES = ("sumocfg", "fcd", "tracks")
 Tracks = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)]
 
 
+def _allow_table(schema: dict[str, Any]) -> None:
+    schema["type"] = ["array", "string"]
+
+
+Counts = Annotated[tuple[CountConfig, ...], Field(json_schema_extra=_allow_table)]
+"""A scenario file may name a CSV table instead of the rows, which is read with it."""
+
+
 class PeriodConfig(StrictModel):
     """A part of the day with traffic of its own. Keys that are not set are those of ``[traffic]``."""
 
@@ -89,7 +102,7 @@ class PeriodConfig(StrictModel):
     fcd: str | None = Field(None, description="Finished FCD file of this period")
     tracks: Tracks | None = Field(None, description="Files of recorded tracks of this period")
     routes: tuple[str, ...] = Field((), description="Route files of this period")
-    counts: tuple[CountConfig, ...] = Field((), description="Traffic counts of this period")
+    counts: Counts = Field((), description="Traffic counts of this period, in rows or in a CSV table")
     vehicles: int | None = Field(None, ge=1, description="Number of vehicles in the network in this period")
     begin_s: float | None = Field(None, ge=0, description="As traffic.begin_s")
     length_s: Positive | None = Field(None, description="Duration of the recording, instead of traffic.frames")
@@ -369,8 +382,10 @@ class TrafficConfig(StrictModel):
         description="Plans of traffic signals, by the id of the signal or junction, or its street names with '/'"
         " between them. By default, those of the network",
     )
-    counts: tuple[CountConfig, ...] = Field(
-        (), description="Traffic counts. By default, random trips are drawn between the network's fringe edges"
+    counts: Counts = Field(
+        (),
+        description="Traffic counts: rows, or the name of a CSV table with the columns from_edge and to_edge, or edge,"
+        " and count. By default, random trips are drawn between the network's fringe edges",
     )
     observed: str | None = Field(
         None,

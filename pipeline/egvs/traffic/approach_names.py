@@ -4,6 +4,8 @@ The approach from the north lies on the north side, and its vehicles drive south
 the arm that they belong to in the same way, so that counts, signal plans, zones, lanes and crosswalks of one arm share
 one name.
 
+A street between two nodes of one signal is no approach; its name ends with "inside".
+
 **Side.** The nearest of eight compass points to the direction from the junction along the last :data:`HEADING_OVER_M`
 of the road (of an exit: the first ones). A shorter road is followed back while a single road leads to it. At a
 roundabout, the direction is that from the middle of its ring.
@@ -22,6 +24,10 @@ import numpy as np
 from egvs.core import polylines
 from egvs.traffic.directions import Floats, arrival_side, compass
 from egvs.traffic.network import TURNAROUNDS, Edge, Network
+
+INSIDE = "inside"
+ALIASES_OVER_M = 150.0
+"""A street that becomes the approach within this distance of the junction is another name of the approach."""
 
 HEADING_OVER_M = 30.0
 """The direction of a road at a junction is that of its last metres before it, or of its first ones after it."""
@@ -74,6 +80,7 @@ class ApproachNames:
     def __init__(self, network: Network) -> None:
         self._edges = {edge.id: edge for edge in network.all_edges}
         self._nodes_m = {node.id: np.asarray(node.at_m) for node in network.junctions}
+        self._groups = [*network.signal_groups.values()]
         self._rings = [frozenset(roundabout.nodes) for roundabout in network.roundabouts]
         before: dict[str, set[str]] = {}
         after: dict[str, set[str]] = {}
@@ -111,13 +118,32 @@ class ApproachNames:
         """Return the street of an edge on one line; empty if it has none."""
         return plain_text(self._edges[edge_id].name)
 
+    def aliases(self, edge_id: str) -> tuple[str, ...]:
+        """Return the other streets that lead to the end of an edge, while a single road does, the nearest first."""
+        streets: dict[str, None] = {}
+        length_m, edge, visited = 0.0, edge_id, {edge_id}
+        while edge in self._previous and length_m <= ALIASES_OVER_M and self._previous[edge] not in visited:
+            edge = self._previous[edge]
+            visited.add(edge)
+            streets[self.street(edge)] = None
+            length_m += self._edges[edge].lanes[0].length_m
+        return tuple(street for street in streets if street not in ("", self.street(edge_id)))
+
+    def is_inside(self, edge_id: str) -> bool:
+        """Return whether an edge leads from one node of a signal to another one."""
+        ends = {self._edges[edge_id].from_node, self._edges[edge_id].to_node}
+        return any(ends <= group for group in self._groups)
+
     def approach(self, edge_id: str) -> str:
         """Return the name of the approach that ends with an edge."""
-        return approach_name(self.side(edge_id), self.street(edge_id))
+        return self._marked(approach_name(self.side(edge_id), self.street(edge_id)), edge_id)
+
+    def _marked(self, name: str, edge_id: str) -> str:
+        return f"{name} {INSIDE}" if self.is_inside(edge_id) else name
 
     def exit(self, edge_id: str) -> str:
         """Return the name of the arm on which an edge leaves a junction."""
-        return approach_name(compass(self.exit_heading(edge_id)), self.street(edge_id))
+        return self._marked(approach_name(compass(self.exit_heading(edge_id)), self.street(edge_id)), edge_id)
 
     def crossed_arm(self, crossing_id: str) -> Arm:
         """Return the arm that a crossing crosses; where only its exit is crossed, the approach beside it."""

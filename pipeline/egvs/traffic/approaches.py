@@ -122,6 +122,8 @@ class ApproachMovement:
         Side on which the vehicles arrive, street there (may be empty), and turn.
     edges, heading
         The edges to the junction, and the direction (2,) of arrival.
+    aliases
+        Other streets that lead to the approach.
     """
 
     flow: CountConfig
@@ -130,6 +132,7 @@ class ApproachMovement:
     turn: str
     edges: tuple[Edge, ...]
     heading: Floats
+    aliases: tuple[str, ...] = ()
 
     @property
     def approach_title(self) -> str:
@@ -138,7 +141,14 @@ class ApproachMovement:
 
     def is_called(self, name: str) -> bool:
         """Whether a name in the form of :func:`normalise_street` is its street, or its approach."""
-        return name == normalise_street(self.street) or name in approach_spellings(self.side, self.street)
+        return self._is_on(self.street, name)
+
+    def has_alias(self, name: str) -> bool:
+        """Whether a name is that of another street that leads to the approach."""
+        return any(self._is_on(street, name) for street in self.aliases)
+
+    def _is_on(self, street: str, name: str) -> bool:
+        return name == normalise_street(street) or name in approach_spellings(self.side, street)
 
 
 @dataclass(frozen=True)
@@ -163,7 +173,9 @@ class ApproachIndex:
             movement = names.movement(flow.edge or flow.from_edge or "", flow.to_edge)
             side = arrival_side(movement.heading)
             movements.append(
-                ApproachMovement(flow, side, movement.street, movement.turn, movement.approach, movement.heading)
+                ApproachMovement(
+                    flow, side, movement.street, movement.turn, movement.approach, movement.heading, movement.aliases
+                )
             )
         return cls(tuple(movements))
 
@@ -179,9 +191,11 @@ class ApproachIndex:
         if side is not None:
             return "", side
         name = normalise_street(text)
-        for move in self.movements:
-            if name in approach_spellings(move.side, move.street):
-                return move.street, move.side
+        for alias in (False, True):
+            for move in self.movements:
+                for street in move.aliases if alias else (move.street,):
+                    if name in approach_spellings(move.side, street):
+                        return move.street, move.side
         problem = f"expected the side on which vehicles arrive, got {text!r}"
         raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {self.hint}")
 
@@ -206,12 +220,11 @@ class ApproachIndex:
             When no approach, several different approaches, or no movement has these names.
         """
         name = normalise_street(street)
-        candidates = [move for move in self.movements if not name or move.is_called(name)]
-        if not candidates:
+        called = [move for move in self.movements if not name or move.is_called(name)]
+        otherwise = [move for move in self.movements if move.has_alias(name)]
+        if not called and not otherwise:
             raise InputError(where, f"no approach of the junction is called {street!r}", self.hint)
-        if side is not None:
-            near = [move for move in candidates if _side_distance(move.side, side) <= 1]
-            candidates = [move for move in near if move.side == side] or near
+        candidates = _on_side(called, side) or _on_side(otherwise, side)
         words = " ".join(word for word in (street, f"from the {side}" if side else "") if word)
         approaches = dict.fromkeys(move.approach_title for move in candidates)
         if not approaches:
@@ -237,6 +250,12 @@ class ApproachIndex:
         """The approaches, in the order of the compass."""
         sides = sorted(self.movements, key=lambda move: (CLOCKWISE.index(COMPASS.index(move.side)), move.street))
         return list(dict.fromkeys(move.approach_title for move in sides))
+
+
+def _on_side(movements: Sequence[ApproachMovement], side: str | None) -> list[ApproachMovement]:
+    """Return the movements that arrive on a side, or else on a neighbouring one; all if the side is None."""
+    near = [move for move in movements if side is None or _side_distance(move.side, side) <= 1]
+    return [move for move in near if move.side == side] or near
 
 
 def _side_distance(first: str, second: str) -> int:

@@ -1,8 +1,7 @@
 """Movements in words: "High Street (east), left to Station Road".
 
 The approach is that at the junction (:mod:`egvs.traffic.approach_names`), not the edge of the count, which may be far
-from it. All movements of one edge on one street have the same approach, also those that leave it before the junction,
-for example on a lane for right turns beside the signals: that of the movement that passes nearest to the middle of the
+from it. All movements of one edge have the same approach: that of the movement that passes nearest to the middle of the
 junction, as zones and signals name it. Their turn is the change of direction from the approach to the exit.
 
 World frame, in plan: x east, y north, metres.
@@ -51,12 +50,18 @@ class Movement(NamedTuple):
         Direction (2,) in which vehicles arrive at the junction, not normalised: x east, y north.
     turn
         A value of :data:`~egvs.traffic.directions.TURNS`; empty for all vehicles of an approach.
+    aliases
+        Other streets that lead to the approach.
+    way_out
+        Name of the street on which it leaves the junction; may be empty.
     """
 
     approach: tuple[Edge, ...]
     street: str
     heading: Floats
     turn: str
+    aliases: tuple[str, ...] = ()
+    way_out: str = ""
 
 
 class MovementNames:
@@ -77,7 +82,7 @@ class MovementNames:
         self._edges = {edge.id: edge for edge in network.edges}
         self._approaches = ApproachNames(network)
         self._nodes_m = {node.id: node.at_m for node in network.junctions}
-        self._roundabouts = [set(roundabout.nodes) for roundabout in network.roundabouts]
+        self._several_nodes = [set(ring.nodes) for ring in network.roundabouts] + [*network.signal_groups.values()]
         self._routes = RouteFinder(network, CAR)
         self._turns: dict[tuple[str, str], str] = {}
         for connection in network.connections:
@@ -85,13 +90,15 @@ class MovementNames:
                 ends = network.edges[connection.source].id, network.edges[connection.target].id
                 self._turns.setdefault(ends, TURNS[connection.direction])
         self._passages: dict[tuple[str, str], _Passage] = {}
-        self._nearest: dict[tuple[str, str], _Passage] = {}
+        self._nearest: dict[str, _Passage] = {}
+        self._ways: dict[str, list[Edge]] = {}
         for flow in flows:
             if flow.from_edge is not None and flow.to_edge is not None:
                 passage = self._passage(flow.from_edge, flow.to_edge)
-                key = flow.from_edge, passage.to_junction[-1].name
-                if key not in self._nearest or passage.distance_m < self._nearest[key].distance_m:
-                    self._nearest[key] = passage
+                self._ways.setdefault(flow.from_edge, []).extend(passage.to_junction)
+                former = self._nearest.setdefault(flow.from_edge, passage)
+                if passage.distance_m < former.distance_m:
+                    self._nearest[flow.from_edge] = passage
 
     def describe(self, from_edge: str, to_edge: str | None) -> str:
         """Return a movement in words.
@@ -110,16 +117,13 @@ class MovementNames:
         str
             For example ``"High Street (east), left to Station Road"``.
         """
-        first = self._edges[from_edge]
         if to_edge is None:
-            return self._approaches.approach(first.id)
+            edges = self._edges_to_junction(from_edge)
+            return self._approaches.approach(edges[-1].id)
 
         passage = self._passage(from_edge, to_edge)
         approach, way_out = self._approach(passage), passage.from_junction[0]
         words = self._approaches.approach(approach.id)
-        if first.name not in ("", approach.name):
-            words += f" from {_street(first)}"
-
         turn = self._turn(passage)
         last = passage.from_junction[-1]
         towards = f" towards {_street(last)}" if last.name not in ("", way_out.name) else ""
@@ -129,13 +133,22 @@ class MovementNames:
 
     def movement(self, from_edge: str, to_edge: str | None) -> Movement:
         """Return approach and turn of a movement; parameters as of :meth:`describe`."""
-        first = self._edges[from_edge]
-        if to_edge is None:
-            return Movement((first,), self._approaches.street(first.id), self._approaches.heading(first.id), "")
-        passage = self._passage(from_edge, to_edge)
-        edge = self._approach(passage).id
-        street, heading = self._approaches.street(edge), self._approaches.heading(edge)
-        return Movement(tuple(passage.to_junction), street, heading, self._turn(passage))
+        edges, turn, way_out = self._edges_to_junction(from_edge), "", ""
+        if to_edge is not None:
+            passage = self._passage(from_edge, to_edge)
+            edges, turn = tuple(self._nearest.get(from_edge, passage).to_junction), self._turn(passage)
+            way_out = self._approaches.street(passage.from_junction[0].id)
+        last = edges[-1].id
+        ways = self._ways.get(from_edge, edges)
+        aliases = [self._approaches.street(edge.id) for edge in ways] + [*self._approaches.aliases(last)]
+        street = self._approaches.street(last)
+        others = tuple(dict.fromkeys(name for name in aliases if name not in ("", street)))
+        return Movement(edges, street, self._approaches.heading(last), turn, others, way_out)
+
+    def _edges_to_junction(self, from_edge: str) -> tuple[Edge, ...]:
+        if from_edge in self._nearest:
+            return tuple(self._nearest[from_edge].to_junction)
+        return (self._edges[from_edge],)
 
     def _turn(self, passage: _Passage) -> str:
         """Return SUMO's turn where a connection joins the edges at the junction, otherwise that of their directions."""
@@ -146,8 +159,7 @@ class MovementNames:
 
     def _approach(self, passage: _Passage) -> Edge:
         """Return the edge whose name the approach of a movement has."""
-        first, last = passage.to_junction[0], passage.to_junction[-1]
-        return self._nearest.get((first.id, last.name), passage).to_junction[-1]
+        return self._nearest.get(passage.to_junction[0].id, passage).to_junction[-1]
 
     def _passage(self, from_edge: str, to_edge: str) -> _Passage:
         """Find the junction on the fastest way between two edges."""
@@ -166,7 +178,7 @@ class MovementNames:
         distance_m = min(distances_m)
         nearest = distances_m.index(distance_m)
 
-        for ring in self._roundabouts:
+        for ring in self._several_nodes:
             if nodes[nearest] in ring:
                 on_ring = [index for index, node in enumerate(nodes) if node in ring]
                 return _Passage(way[: on_ring[0] + 1], way[on_ring[-1] + 1 :], distance_m)

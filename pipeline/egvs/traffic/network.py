@@ -222,6 +222,8 @@ class Connection:
         SUMO's code ("s", "l", "R" ...); may be empty.
     via
         First lane inside the junction; may be empty.
+    signal
+        Id of the signal that governs it; may be empty.
     """
 
     source: int
@@ -231,6 +233,7 @@ class Connection:
     direction: str
     permission: Permission
     via: str
+    signal: str = ""
 
 
 @dataclass(frozen=True)
@@ -338,6 +341,15 @@ class Network:
     def edges(self) -> tuple[Edge, ...]:
         """Roads: edges without a function."""
         return tuple(edge for edge in self.all_edges if not edge.function)
+
+    @cached_property
+    def signal_groups(self) -> dict[str, frozenset[str]]:
+        """Nodes of each signal that governs several, by its id: one junction on the ground."""
+        nodes: dict[str, set[str]] = {}
+        for connection in self.connections:
+            if connection.signal:
+                nodes.setdefault(connection.signal, set()).add(self.edges[connection.source].to_node)
+        return {signal: frozenset(governed) for signal, governed in nodes.items() if len(governed) > 1}
 
     @cached_property
     def has_heights(self) -> bool:
@@ -620,7 +632,8 @@ def _parse_connections(
             raise InputError(path, f"a <connection> from {start!r} refers to a lane that does not exist", _HINT)
         permission = Permission.from_attributes(connection)
         direction = connection.get("dir", "")
-        yield Connection(source, source_lane, target, target_lane, direction, permission, connection.get("via", ""))
+        via, signal = connection.get("via", ""), connection.get("tl", "")
+        yield Connection(source, source_lane, target, target_lane, direction, permission, via, signal)
 
 
 def _point(text: str) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from egvs.core.grid import Roi
 from egvs.core.wording import shorten_id
 from egvs.scenario.model import Scenario
 from egvs.traffic import network
+from egvs.traffic.assumed_plans import is_assumed
 from egvs.traffic.directions import CLOCKWISE, COMPASS
 from egvs.traffic.signal_plans import find_signal
 from egvs.traffic.signals import (
@@ -37,9 +38,9 @@ def describe_simulated(scenario: Scenario, path: Path, roads: network.Network) -
     planned = {}
     for name, config in scenario.traffic.signals.items():
         signal = find_signal(name, found, f"{scenario.file}: traffic.signals.{name}")
-        planned[signal.id] = config.file or "from the scenario"
-    is_assumed = any("signal" in entry for entry in scenario.assumed)
-    return describe_signals(found, scenario.roi.box, planned, ASSUMED_SOURCE if is_assumed else "from the network")
+        planned[signal.id] = ASSUMED_SOURCE if is_assumed(signal) else config.file or "from the scenario"
+    assumes_plans = any("signal" in entry for entry in scenario.assumed)
+    return describe_signals(found, scenario.roi.box, planned, ASSUMED_SOURCE if assumes_plans else "from the network")
 
 
 def describe_signals(
@@ -61,9 +62,9 @@ def describe_signals(
     Returns
     -------
     list of dict
-        ``signal``, ``streets``, ``source``, ``type``, ``cycle_s``, ``max_cycle_s`` (of actuated signals), ``offset_s``,
-        and ``rows`` (none where a recording is replayed): ``approach``, ``movements``, ``green_s`` and ``yellow_s``
-        (pairs of begin and end in the cycle), and ``gives_way`` (whether all of its green gives way).
+        ``signal``, ``streets``, ``source``, ``type``, ``cycle_s``, ``offset_s``, and ``rows`` (none where a recording
+        is replayed): ``approach``, ``movements``, ``green_s`` and ``yellow_s`` (pairs of begin and end in the cycle),
+        and ``gives_way`` (whether all of its green gives way). Actuated signals are described by their longest greens.
     """
     (x0, y0), (width, depth) = region.origin_m[:2], region.size_m[:2]
     described = []
@@ -75,14 +76,12 @@ def describe_signals(
         kind = "fixed" if program.type == "static" else program.type
         if program.clock is not None or len(program.phases) > _MAX_PHASES:
             kind = "replayed"
-        longest_s = sum(phase.max_s if phase.max_s is not None else phase.duration_s for phase in program.phases)
         described.append({
             "signal": signal.id,
             "streets": list(signal.streets),
             "source": planned.get(signal.id, network_source),
             "type": kind,
             "cycle_s": round(program.cycle_s, 3),
-            "max_cycle_s": round(longest_s, 3),
             "offset_s": program.offset_s,
             "rows": [] if kind == "replayed" else list(_movement_rows(signal)),
         })  # fmt: skip
@@ -116,8 +115,8 @@ def _intervals(letters: str, program: Program, accepted: frozenset[str]) -> list
     """Return begin and end in the cycle of each run of phases with one of the letters."""
     intervals: list[list[float]] = []
     begin_s = 0.0
-    for letter, phase in zip(letters, program.phases, strict=True):
-        end_s = round(begin_s + phase.duration_s, 3)
+    for letter, duration_s in zip(letters, program.longest_s, strict=True):
+        end_s = round(begin_s + duration_s, 3)
         if letter in accepted:
             if intervals and intervals[-1][1] == begin_s:
                 intervals[-1][1] = end_s
@@ -139,9 +138,7 @@ def format_plan(plan: Mapping[str, Any]) -> str:
     """
     if not plan["rows"]:
         return f"Signals at {plan_title(plan)} ({plan['source']}): {plan['cycle_s']:g} s of a recording are replayed."
-    cycle = f"cycle {plan['cycle_s']:g} s"
-    if plan["type"] != "fixed":
-        cycle = f"cycle up to {plan['max_cycle_s']:g} s"
+    up_to = "" if plan["type"] == "fixed" else "up to "
     by_approach: dict[str, list[Mapping[str, Any]]] = {}
     for row in plan["rows"]:
         if row["movements"] != [CROSSING]:
@@ -161,4 +158,5 @@ def format_plan(plan: Mapping[str, Any]) -> str:
     greens = "; ".join(listed[:_MAX_GREENS])
     if len(listed) > _MAX_GREENS:
         greens += f"; {len(listed) - _MAX_GREENS} more in the report"
-    return f"Signals at {plan_title(plan)} ({plan['source']}): {plan['type']}, {cycle}; green {greens}."
+    control = f"{plan['type']}, cycle {up_to}{plan['cycle_s']:g} s"
+    return f"Signals at {plan_title(plan)} ({plan['source']}): {control}; green {up_to}{greens}."

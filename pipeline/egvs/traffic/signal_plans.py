@@ -108,7 +108,7 @@ def _programs(scenario: Scenario, path: Path, roads: network.Network) -> dict[st
         signal = find_signal(name, signals, where)
         if signal.id in programs:
             raise InputError(where, f"the signal {signal.title} has two plans", "Remove one of them.")
-        programs[signal.id] = _make_program(config, signal, scenario, where)
+        programs[signal.id] = _plan_program(config, signal, scenario, where)
     return programs
 
 
@@ -141,17 +141,49 @@ def _list_signals(signals: Sequence[Signal]) -> str:
     return list_first(titles, _MAX_NAMED) or "none"
 
 
-def _make_program(config: SignalConfig, signal: Signal, scenario: Scenario, where: str) -> Program:
+def _plan_program(config: SignalConfig, signal: Signal, scenario: Scenario, where: str) -> Program:
     if config.file is not None:
         path = scenario.find(config.file, f"{where.partition(': ')[2]}.file")
         if config.is_sumo_file:
             return _read_program(path, config, signal)
         config = config.model_copy(update={"phases": _read_table(path, config), "file": None})
         where = str(path)
-    greens = [_green_links(phase, signal, f"{where}: phase {n}") for n, phase in enumerate(config.phases, start=1)]
+    return make_program(config, signal, where)
+
+
+def make_program(config: SignalConfig, signal: Signal, where: str) -> Program:
+    """Return the program of a plan with phases.
+
+    Parameters
+    ----------
+    config
+        The plan.
+    signal
+        Its signal.
+    where
+        File and key of the plan, for messages.
+
+    Raises
+    ------
+    InputError
+        When an approach or a movement is unknown, movements of a phase conflict, one never has green, or the phases do
+        not fill the cycle.
+    """
+    stated: set[str] = set()
+    red: set[str] = set()
+    for number, phase in enumerate(config.phases, start=1):
+        for text, movements in phase.green.items():
+            approach = _links_of_approach(text, signal, f"{where}: phase {number}")[0].approach
+            stated.add(approach)
+            if not movements:
+                red.add(approach)
+    greens = [
+        _green_links(phase, signal, f"{where}: phase {n}", stated) for n, phase in enumerate(config.phases, start=1)
+    ]
     for number, green in enumerate(greens, start=1):
         _check_conflicts(green, signal, f"{where}: phase {number}")
-    _check_never_green(set().union(*greens), signal, where)
+    may_be_red = {link.index for link in signal.links if link.approach in red}
+    _check_never_green(may_be_red.union(*greens), signal, where)
     phases = tuple(_phases(config, greens, signal))
     program = Program("static" if config.type == "fixed" else "actuated", config.offset_s, phases)
     if config.cycle_s is not None and abs(program.cycle_s - config.cycle_s) > 1e-6:
@@ -161,10 +193,12 @@ def _make_program(config: SignalConfig, signal: Signal, scenario: Scenario, wher
     return program
 
 
-def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str) -> set[int]:
+def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str, stated: Set[str] = frozenset()) -> set[int]:
     """Return the positions of the links with green in a phase.
 
-    A crossing that no phase names has green where no green conflicts with it, except turns that give way to people.
+    A street between two nodes of the signal has green with the movements that lead to it, if it is no approach that the
+    plan states and no green conflicts with it. A crossing that no phase names has green where no green conflicts with
+    it, except turns that give way to people.
     """
     green: set[int] = set()
     for approach, movements in phase.green.items():
@@ -175,11 +209,21 @@ def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str) -> set[in
             selected = [link for link in on_approach if requested in (_ALL, link.movement)]
             if requested == _ALL:
                 selected = [link for link in selected if link.movement != CROSSING]
+            if not selected:  # vehicles drive straight on first, and turn behind a street inside the junction
+                turning = {link.edge for link in signal.links if link.movement == requested}
+                selected = [link for link in on_approach if link.target in turning]
             if not selected:
                 known = ", ".join(dict.fromkeys(link.movement for link in on_approach))
                 problem = f"approach {approach!r} has no movement {movement!r}"
                 raise InputError(where, problem, f"Its movements are: {known}.")
             green |= {link.index for link in selected}
+    inside = [link for link in signal.links if link.edge and link.approach not in stated]
+    for _ in signal.nodes:
+        reached = {link.target for link in signal.links if link.index in green}
+        for link in inside:
+            is_free = all(agree(link, other) for other in signal.links if other.index in green)
+            if link.edge in reached and is_free:
+                green.add(link.index)
     vehicles = [link for link in signal.links if link.index in green and link.movement != CROSSING]
     for link in signal.links:
         if link.movement == CROSSING and all(_gives_way_to_people(each, link) for each in vehicles):
@@ -194,16 +238,22 @@ def _gives_way_to_people(link: Link, crossing: Link) -> bool:
 
 
 def _links_of_approach(approach: str, signal: Signal, where: str) -> list[Link]:
+    """Return the links of the approach of this name: the full name, else one of its parts, else that of an alias."""
     side = parse_side(approach)
-    street = normalise_street(approach)
+    name = normalise_street(approach)
+
+    def is_full_name(link: Link) -> bool:
+        return name in (normalise_street(link.approach), normalise_street(link.edge))
+
+    def is_part(link: Link) -> bool:
+        return (side is not None and side == link.side) or name in _spellings(link, link.street)
+
+    def is_alias(link: Link) -> bool:
+        return any(name in _spellings(link, street) for street in link.aliases)
+
     matches: list[str] = []
-    for link in signal.links:
-        names = {normalise_street(link.approach), normalise_street(link.street), normalise_street(link.edge)} - {""}
-        if link.side and link.street:
-            names |= approach_spellings(link.side, link.street)
-        is_meant = street in names or (side is not None and side == link.side)
-        if is_meant and link.approach not in matches:
-            matches.append(link.approach)
+    for is_meant in (is_full_name, is_part, is_alias):
+        matches = matches or list(dict.fromkeys(link.approach for link in signal.links if is_meant(link)))
     known = "; ".join(f"{name} ({', '.join(movements)})" for name, movements in signal.approaches.items())
     if not matches:
         raise InputError(
@@ -215,16 +265,28 @@ def _links_of_approach(approach: str, signal: Signal, where: str) -> list[Link]:
     return [link for link in signal.links if link.approach == matches[0]]
 
 
+def _spellings(link: Link, street: str) -> frozenset[str]:
+    """Return what a user may write for the approach of a link on a street."""
+    if not street:
+        return frozenset()
+    return frozenset({normalise_street(street)}) | (approach_spellings(link.side, street) if link.side else frozenset())
+
+
 def _check_conflicts(green: set[int], signal: Signal, where: str) -> None:
     links = [link for link in signal.links if link.index in green]
     for a, b in combinations(links, 2):
-        if a.index != b.index and b.index in a.foes and not _may_be_green_together(a, b):
+        if not agree(a, b):
             problem = f"{a.title} and {b.title} conflict, but both have green"
             raise InputError(where, problem, "Give them green in different phases.")
 
 
-def _may_be_green_together(a: Link, b: Link) -> bool:
-    """Whether one of two links that conflict turns and gives way to people, or to oncoming traffic."""
+def agree(a: Link, b: Link) -> bool:
+    """Whether two links may have green together.
+
+    They do not conflict, or one of them turns and gives way to people, or to oncoming traffic.
+    """
+    if a.index == b.index or (b.index not in a.foes and a.index not in b.foes):
+        return True
     for turning, other in ((a, b), (b, a)):
         if turning.movement == CROSSING:
             continue
@@ -246,7 +308,7 @@ def _cosine(a: Floats, b: Floats) -> float:
 def _check_never_green(green: set[int], signal: Signal, where: str) -> None:
     red = dict.fromkeys(link.title for link in signal.links if link.index not in green and link.movement != CROSSING)
     if red:
-        hint = "A plan replaces all phases of the signal: add these movements to a phase."
+        hint = "Add these movements to a phase, or name their approach without movements if it stays red."
         raise InputError(where, f"never green: {', '.join(red)}", hint)
 
 
@@ -337,8 +399,8 @@ def _read_table(path: Path, config: SignalConfig) -> tuple[SignalPhaseConfig, ..
 
     def parse(where: str, row: dict[str, str]) -> tuple[()]:
         values = phases.setdefault(row["phase"], {"green": {}})
-        movements = values["green"].setdefault(row["approach"], [])
-        movements += row["movement"].split()
+        if row["approach"]:
+            values["green"].setdefault(row["approach"], []).extend(row["movement"].split())
         for key in ("green_s", *CSV_OPTIONAL):
             text = row.get(key, "")
             if not text:

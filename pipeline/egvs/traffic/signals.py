@@ -48,13 +48,18 @@ class Link:
     movement
         One of :data:`MOVEMENTS`.
     edge, street
-        Edge of the approach, and its street; empty for a crossing, and for a street without a name.
+        Edge of the approach, and its street; empty for a crossing, and for a street without a name or inside the
+        junction.
     heading
         Direction in which vehicles arrive, (2,); None for a crossing.
     foes, yields_to
         Positions of the links that conflict with it, and of those that it gives way to.
     side
-        Side of the junction where the approach lies.
+        Side of the junction where the approach lies; empty for a street inside the junction.
+    target
+        Edge to which it leads; empty for a crossing.
+    aliases
+        Other streets that lead to the approach.
     """
 
     index: int
@@ -66,6 +71,8 @@ class Link:
     foes: frozenset[int] = frozenset()
     yields_to: frozenset[int] = frozenset()
     side: str = ""
+    target: str = ""
+    aliases: tuple[str, ...] = ()
 
     @property
     def title(self) -> str:
@@ -127,9 +134,16 @@ class Program:
         return cls(element.get("type", "static"), float(element.get("offset", "0")), tuple(phases), clock, params)
 
     @property
+    def longest_s(self) -> tuple[float, ...]:
+        """Duration of each phase; of actuated signals, the longest one."""
+        if self.type == "static":
+            return tuple(phase.duration_s for phase in self.phases)
+        return tuple(phase.duration_s if phase.max_s is None else phase.max_s for phase in self.phases)
+
+    @property
     def cycle_s(self) -> float:
-        """Sum of the durations of the phases."""
-        return sum(phase.duration_s for phase in self.phases)
+        """Duration of the cycle; of actuated signals, the longest one."""
+        return sum(self.longest_s)
 
     def to_xml(self, name: str) -> str:
         """Return the ``<tlLogic>`` as netconvert writes it."""
@@ -292,8 +306,11 @@ def _read_signal(
         index = int(connection["linkIndex"])
         if start in names:
             movement = TURNS.get(connection.get("dir", ""), "straight")
-            street, heading, side = approaches.street(start), approaches.heading(start), approaches.side(start)
-            link = Link(index, names[start], movement, start, street, heading, foes, yields_to, side)
+            heading, target = approaches.heading(start), connection["to"]
+            street, side, aliases = approaches.street(start), approaches.side(start), approaches.aliases(start)
+            if approaches.is_inside(start):
+                street, side, aliases = "", "", ()
+            link = Link(index, names[start], movement, start, street, heading, foes, yields_to, side, target, aliases)
         else:
             arm = approaches.crossed_arm(connection["to"])
             link = Link(index, names.get(arm.edge, arm.name), CROSSING, "", "", None, foes, yields_to, arm.side)

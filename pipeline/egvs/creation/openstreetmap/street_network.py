@@ -30,14 +30,17 @@ from egvs.creation import junctions
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.creation.openstreetmap import ATTRIBUTION, street_turns
 from egvs.creation.openstreetmap.restrictions import is_restriction, restrictions_of_pieces
+from egvs.creation.openstreetmap.street_signals import number_crossings, signals_at_stop_lines, without_signal
 from egvs.creation.plain_network import NETWORK_FILE
-from egvs.formats import xml
 from egvs.formats.osm import OsmExtract, Way, parse_number
-from egvs.traffic import sumo, sumo_folder
-from egvs.traffic.network import Location
+from egvs.traffic import sumo
+from egvs.traffic.assumed_plans import assumed_plan
+from egvs.traffic.network import Location, Network
+from egvs.traffic.signal_plans import make_program
+from egvs.traffic.signals import read_signals, replace_programs
 
 NETCONVERT_FLAGS = (
-    "--geometry.remove", "--junctions.join", *sumo_folder.OSM_SIGNALS,
+    "--geometry.remove", "--junctions.join", "--tls.default-type", "actuated", "--default.connection.cont-pos", "0",
     "--keep-edges.by-vclass", "passenger,bus,truck", "--remove-edges.isolated",
     "--output.street-names", "--precision", "3",
     "--no-turnarounds.except-deadend", "--junctions.right-before-left.speed-threshold", "0",
@@ -55,12 +58,6 @@ REPAIR_FLAGS = (
     "--offset.disable-normalization", "--output.street-names", "--precision", "3", street_turns.ORIGINAL_NAMES_FLAG,
 )  # fmt: skip
 """How netconvert reads and writes a network whose turns are repaired: all other parts stay the same."""
-
-JOINED_SIGNALS_FLAG = "--tls.join"
-LONGEST_PROGRAM_S = 120.0
-"""A signal program for several nodes may not be longer: one of 16 phases and 272 s, one approach after another, let
-less than half of the usual traffic pass.
-"""
 
 SIDEWALK_FLAGS = ("--sidewalks.guess", "--sidewalks.guess.max-speed", "28", "--crossings.guess")
 """Sidewalks, walking areas at their corners, and crossings between these.
@@ -135,8 +132,7 @@ def build_network(
     osm
         Its file, for messages.
     flags
-        Flags of netconvert. :data:`JOINED_SIGNALS_FLAG` is dropped if a signal program gets longer than
-        :data:`LONGEST_PROGRAM_S`.
+        Flags of netconvert.
     frame
         The frame of the network; by default, netconvert chooses one.
     radius_m
@@ -159,18 +155,20 @@ def build_network(
         raise no_streets
 
     with files.temporary_folder() as folder:
-        _write_streets(extract, folder / "streets.osm.xml")
+        roads = [way.id for way in extract.ways.values() if is_road(way)]
+        at_stop_lines = signals_at_stop_lines(extract, roads, walk=SIDEWALK_FLAGS[0] in flags)
+        _write_streets(extract, folder / "streets.osm.xml", at_stop_lines)
         try:
             arguments = ["--osm-files", "streets.osm.xml", *flags, *_frame_flags(frame)]
-            notes = _convert(extract, arguments, folder)
-            if JOINED_SIGNALS_FLAG in arguments and longest_program_s(folder / NETWORK_FILE) > LONGEST_PROGRAM_S:
-                arguments.remove(JOINED_SIGNALS_FLAG)
-                notes = _convert(extract, arguments, folder)
+            sumo.run_netconvert([*arguments, street_turns.ORIGINAL_NAMES_FLAG], folder, NETWORK_FILE)
+            lefthand = "--lefthand" in arguments
+            notes = street_turns.repair_turns(extract, folder, NETWORK_FILE, REPAIR_FLAGS, lefthand=lefthand)
             text = street_turns.strip_origins((folder / NETWORK_FILE).read_text(encoding="utf-8"))
-            files.write_text(folder / NETWORK_FILE, text)
+            files.write_text(folder / NETWORK_FILE, number_crossings(text))
             if frame is not None:
                 _state_offset(folder / NETWORK_FILE, frame)
             streets = junctions.read_streets(folder / NETWORK_FILE)
+            _plan_signals(folder / NETWORK_FILE, streets.network)
         except (RunError, InputError) as error:
             if _NOTHING_LOADED.search(str(error)):
                 raise no_streets from None
@@ -184,23 +182,13 @@ def build_network(
     return StreetNetwork(text, streets, notes)
 
 
-def _convert(extract: OsmExtract, arguments: Sequence[str], folder: Path) -> tuple[str, ...]:
-    """Run netconvert, and repair the turns of its network; return notes."""
-    sumo.run_netconvert([*arguments, street_turns.ORIGINAL_NAMES_FLAG], folder, NETWORK_FILE)
-    lefthand = "--lefthand" in arguments
-    return street_turns.repair_turns(extract, folder, NETWORK_FILE, REPAIR_FLAGS, lefthand=lefthand)
-
-
-def longest_program_s(path: Path) -> float:
-    """Return the duration of the longest signal program of a network, in seconds; 0 without signals.
-
-    An actuated phase counts with the duration that it has in the fixed-time program.
-    """
-    longest_s = 0.0
-    for element in xml.iter_elements(path, "net"):
-        if element.tag == "tlLogic":
-            longest_s = max(longest_s, math.fsum(float(phase.get("duration", "0")) for phase in element.iter("phase")))
-    return longest_s
+def _plan_signals(path: Path, network: Network) -> None:
+    """Replace the programs of all signals in a network by assumed plans (:mod:`egvs.traffic.assumed_plans`)."""
+    programs = {
+        signal.id: make_program(assumed_plan(signal), signal, f"{path}: {signal.title}")
+        for signal in read_signals(path, network)
+    }
+    files.write_text(path, replace_programs(path.read_text(encoding="utf-8"), programs))
 
 
 def crop_network(
@@ -446,8 +434,11 @@ def _connected_roads(extract: OsmExtract, circle: _Circle) -> set[int]:
     return reached
 
 
-def _write_streets(extract: OsmExtract, xml: Path) -> None:
-    """Write the streets (ways with ``highway``), their nodes, and the turn restrictions as an OpenStreetMap file."""
+def _write_streets(extract: OsmExtract, xml: Path, at_stop_lines: Collection[int]) -> None:
+    """Write the streets (ways with ``highway``), their nodes, and the turn restrictions as an OpenStreetMap file.
+
+    Some nodes are written without their signals.
+    """
     import osmium
     from osmium.osm import mutable
 
@@ -455,8 +446,10 @@ def _write_streets(extract: OsmExtract, xml: Path) -> None:
     with osmium.SimpleWriter(osmium.io.File(xml, "osm")) as writer:
         for node in sorted({n for way in streets for n in way.nodes if n in extract.nodes}):
             lat_deg, lon_deg = extract.nodes[node]
-            tags = sorted(extract.node_tags.get(node, {}).items())
-            writer.add_node(mutable.Node(id=node, location=(lon_deg, lat_deg), tags=tags))
+            node_tags = extract.node_tags.get(node, {})
+            if node in at_stop_lines:
+                node_tags = without_signal(node_tags)
+            writer.add_node(mutable.Node(id=node, location=(lon_deg, lat_deg), tags=sorted(node_tags.items())))
         for way in streets:
             nodes = [n for n in way.nodes if n in extract.nodes]
             name = {"name": way.tags["ref"]} if "ref" in way.tags else {}  # the only name of many main roads

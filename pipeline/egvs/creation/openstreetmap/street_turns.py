@@ -17,6 +17,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from statistics import fmean
 from xml.etree.ElementTree import Element
 
 from egvs.core.grid import XY
@@ -28,6 +29,7 @@ from egvs.creation.openstreetmap.restrictions import (
     TurnRules,
     read_restrictions,
 )
+from egvs.creation.openstreetmap.street_signals import MapSignals, find_signals, is_signal
 from egvs.creation.turns import (
     MOST_LISTED,
     BuiltTurns,
@@ -184,8 +186,11 @@ class StreetGraph:
         self.built = BuiltTurns()
         self.edges: dict[str, StreetEdge] = {}
         self.unknown: list[str] = []
+        self.signalised: set[str] = set()
         for element in xml.iter_elements(network, "net"):
             self.built.add(element)
+            if element.tag == "junction" and element.get("type", "").startswith("traffic_light"):
+                self.signalised.add(element.attrib["id"])
             if element.tag == "edge" and not element.get("function"):
                 self._add_edge(element)
 
@@ -317,7 +322,7 @@ class StreetGraph:
                     continue
                 state = (after, following, for_cars and self._is_for_cars(after))
                 path = (*inside, after)
-                if state not in seen and self._length_m(path) <= _INSIDE_M:
+                if state not in seen and self.length_m(path) <= _INSIDE_M:
                     seen.add(state)
                     queue.append((state[0], state[1], path, state[2]))
 
@@ -344,10 +349,28 @@ class StreetGraph:
         shrink = math.cos(math.radians(self._extract.bounds.south_deg))
         return _EARTH_M * math.radians(lon_deg) * shrink, _EARTH_M * math.radians(lat_deg)
 
-    def _length_m(self, steps: Sequence[Step]) -> float:
+    def length_m(self, steps: Sequence[Step]) -> float:
+        """Return the length of some pieces of ways."""
         return math.fsum(
             math.dist(self._xy(self.start_node(step)), self._xy(self.end_node(step))) for step in steps
         )  # fmt: skip
+
+    def nodes_m(self, nodes: Collection[str]) -> dict[str, XY]:
+        """Return the mean position of the ends of the edges to each of some nodes of the network."""
+        ends: dict[str, list[XY]] = {}
+        for edge in self.edges.values():
+            if edge.to_node in nodes:
+                ends.setdefault(edge.to_node, []).append(self._xy(self.end_node(edge.steps[-1])))
+        return {node: (fmean(x for x, _ in points), fmean(y for _, y in points)) for node, points in ends.items()}
+
+    def is_on_ring(self, node: str) -> bool:
+        """Return whether a node of the network is on a roundabout of the map."""
+        last = [edge.steps[-1] for edge in self.edges.values() if edge.to_node == node]
+        return any(self._ways[step.way].tags.get("junction") in _RINGS for step in last)
+
+    def has_signal(self, node: int) -> bool:
+        """Return whether a node of the map has a traffic signal."""
+        return is_signal(self._extract.node_tags.get(node, {}))
 
     def turned_deg(self, source: str, target: str, inside: Sequence[Step] = ()) -> float:
         """Return the angle of a turn over some pieces of ways, positive to the left; beyond 180 for a circle."""
@@ -413,6 +436,13 @@ class StreetGraph:
         lat_deg, lon_deg = self._extract.nodes[self.end_node(source.steps[-1])]
         text = f"{names[0]} to {names[1]} at {lat_deg:.5f},{lon_deg:.5f}"
         return f"{text} (relation {list_first([str(r) for r in sorted(relations)], 3)})" if relations else text
+
+    def node_title(self, node: str) -> str:
+        """Return the streets that lead to a node of the network, and its position."""
+        last = [edge.steps[-1] for edge in self.edges.values() if edge.to_node == node and edge.car_lanes]
+        streets = sorted({_way_title(self._ways[step.way]) for step in last})
+        lat_deg, lon_deg = self._extract.nodes[self.end_node(last[0])]
+        return f"{' / '.join(streets)} at {lat_deg:.5f},{lon_deg:.5f}"
 
     def is_in_network(self, relation: int) -> bool:
         """Return whether both ends of a restriction are streets of the network, or the one that it names."""
@@ -554,14 +584,15 @@ def repair_turns(
     """
     before = after = compare_with_map(extract, folder / name, lefthand=lefthand)
     closed = _closable(before)
-    if closed or before.lost:
+    signals = find_signals(before.graph)
+    if closed or before.lost or signals.nodes:
         lanes = lanes_of_pairs(before.graph.built.connections)
         removed = [connection for pair in closed for connection in lanes[pair]]
         added = [_connection(before.graph, pair) for pair in before.lost]
-        patch_network(folder, name, f"patched.{name}", removed=removed, added=added, flags=flags)
+        patch_network(folder, name, f"patched.{name}", removed=removed, added=added, flags=flags, signals=signals.nodes)
         (folder / f"patched.{name}").replace(folder / name)
         after = compare_with_map(extract, folder / name, lefthand=lefthand)
-    return tuple(_notes(before, after))
+    return (*_notes(before, after), *_signal_notes(before.graph, signals))
 
 
 def _closable(turns: StreetTurns) -> list[Pair]:
@@ -615,6 +646,16 @@ def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
     if graph.unknown:
         edges = list_first(graph.unknown, MOST_LISTED)
         yield f"The turns of {number_of(len(graph.unknown), 'edge')} could not be compared with the map: {edges}."
+
+
+def _signal_notes(graph: StreetGraph, signals: MapSignals) -> Iterator[str]:
+    """Yield a sentence on the nodes inside signalised junctions that have no signals."""
+    if count := len(signals.ungoverned):
+        nodes = list_first([graph.node_title(node) for node in signals.ungoverned], MOST_LISTED, "; ")
+        yield (
+            f"{number_of(count, 'node')} inside signalised junctions {by_number(count, 'has', 'have')} no signal, since"
+            f" the map has signals on fewer than half of the approaches: {nodes}."
+        )
 
 
 def _assumption_notes(graph: StreetGraph) -> Iterator[str]:

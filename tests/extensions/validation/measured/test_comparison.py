@@ -223,6 +223,18 @@ def test_labels_of_other_sweeps_are_refused(tmp_path: Path, made: tuple[Path, tw
         write_and_compare(tmp_path, renamed, sweeps)
 
 
+def test_damaged_labels_of_a_folder_are_named(tmp_path: Path, made: tuple[Path, twin.Twin]) -> None:
+    """Their content is of no format; other files beside the labels do not count."""
+    _, sweeps = made
+    folder = tmp_path / "labels"
+    folder.mkdir()
+    damaged, *_ = twin.write_openlabel(folder, sweeps)
+    (folder / "calibration.json").write_text("{}")
+    damaged.write_text("1_000")
+    with pytest.raises(InputError, match=rf"{damaged.name}: expected labels .*got another or a damaged file"):
+        write_and_compare(tmp_path, [folder], sweeps)
+
+
 def test_ratio_and_error_by_hand() -> None:
     """Six objects of one box each: the jackknife of a ratio of sums."""
     above, below = np.array([2.0, 4, 6, 8, 10, 12]), np.array([1, 2, 3, 4, 5, 5])

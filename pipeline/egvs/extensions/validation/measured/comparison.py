@@ -245,7 +245,7 @@ def compare_labelled(request: ComparisonRequest, scenario: Scenario | None = Non
         convention of headings is not clear.
     """
     sweeps = _read_sweeps(request)
-    labels = read_labels(request.labels, LabelOptions(request.columns or {}))
+    labels = read_labels(request.labels, LabelOptions(request.columns or {}), sweeps)
     pairs, notes = match_labels(sweeps, labels)
     convention = None
     if request.yaw is not None:
