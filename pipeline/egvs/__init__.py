@@ -45,6 +45,10 @@ From maps to a scenario, and what accuracy and effects cost::
     egvs.run_accuracy_study("myplace", [], "runs/myplace", egvs.StudyOptions(egvs.Tolerance(1.0), budget_s=120.0))
     egvs.effect_statuses(egvs.load("myplace"), "runs/myplace")
 
+Labelled point clouds with traffic, for detectors::
+
+    egvs.write_clouds(egvs.load("myplace"), "clouds", sites=["c03"], frames=100)
+
 Names are imported when they are first used, so that ``import egvs`` costs nothing. Those of an extension are imported
 from its package, for example ``from egvs.extensions.NAME import ...``.
 """
@@ -60,6 +64,7 @@ if TYPE_CHECKING:
     from egvs.artefacts.readers import read_scans, read_scores, read_scores_by_period, read_visibility
     from egvs.artefacts.tpog import Tpog, read_tpog
     from egvs.artefacts.traffic_frames import read_trajectories
+    from egvs.clouds.simulation import write_clouds
     from egvs.core.errors import EgvsError, InputError, RunError
     from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
     from egvs.explore.settings import open_session
@@ -121,6 +126,7 @@ __all__ = [
     "shipped_scenario",
     "verify",
     "what_if",
+    "write_clouds",
 ]
 
 __getattr__, __dir__ = lazy_exports(
@@ -129,6 +135,7 @@ __getattr__, __dir__ = lazy_exports(
         "artefacts.readers": ["read_scans", "read_scores", "read_scores_by_period", "read_visibility"],
         "artefacts.tpog": ["Tpog", "read_tpog"],
         "artefacts.traffic_frames": ["read_trajectories"],
+        "clouds.simulation": ["write_clouds"],
         "core.errors": ["EgvsError", "InputError", "RunError"],
         "creation.new_scenario": ["NewScenarioOptions", "create_scenario"],
         "explore.settings": ["open_session"],

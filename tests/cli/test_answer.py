@@ -9,7 +9,7 @@ import egvs
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.cli import answer
-from egvs.core.errors import collect_warnings
+from egvs.core.errors import WARNINGS_KEY, Diagnostic, collect_warnings
 from egvs.report import ranking_text, sections
 from egvs.report.reliability import by_severity, describe_reliability
 from egvs.results.plans import SensorPlan
@@ -82,6 +82,20 @@ def test_no_fact_is_lost_in_the_report_and_with_verbose(six_poles: Path, tmp_pat
         assert [fact for fact in facts if " ".join(fact.replace("\u2019", "'").split()) not in plain] == []
 
 
+def test_a_pole_in_a_lane_is_named_whatever_else_is_warned_of(
+    mini: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario, out = egvs.load(mini), tmp_path / "out"
+    record = egvs.run(scenario, out)
+    answer.print_answer(out, scenario, record)
+    assert "Careful" not in capsys.readouterr().out
+    best = Ranking.read(out / "scores.parquet").best[0].site
+    in_lane = Diagnostic("sites on lanes", f"sites.csv: site {best}", "(1, 2, 3) is in a lane of Mill Lane", "")
+    record.stages["check"].summary[WARNINGS_KEY] = [in_lane.to_json()]
+    answer.print_answer(out, scenario, record)
+    assert f"\nCareful: {best} stands in a lane of Mill Lane.\n" in capsys.readouterr().out
+
+
 def test_plans_in_one_go(six_poles: Path, tmp_path: Path, run_egvs) -> None:
     out = tmp_path / "out"
     code, printed, error = run_egvs("run", six_poles, "--out", out, "--count", "2")
@@ -123,6 +137,15 @@ def test_signal_plans_are_no_assumption_once_they_are_given(mini: Path) -> None:
     assert sections.assumptions(some, [given, guessed]) == ("traffic (guessed)", "signal plans of Oak Street")
     sentence = "Before you trust this ranking: assumed, not measured: traffic (guessed)."
     assert sections.describe_caveats(some, "ranking", plans=[given]) == sentence
+
+
+def test_existing_poles_are_no_assumption_and_missing_surroundings_are(mini: Path) -> None:
+    keys = ["assumed=['traffic (guessed)', 'positions of the poles']"]
+    for existing, poles in (("'all'", ()), ("['pole_a']", ("positions of the poles other than pole_a",))):
+        scenario = egvs.load(mini, [*keys, f"sites.existing_poles={existing}"])
+        assert sections.assumptions(scenario, ()) == ("traffic (guessed)", *poles)
+    bare = egvs.load(mini, [*keys, "statics.footprints=[]"])
+    assert sections.assumptions(bare, ())[2:] == ("surroundings (no building or tree is known)",)
 
 
 def test_says_that_losses_of_several_sensors_are_off_where_they_are(mini: Path, tmp_path: Path, run_egvs) -> None:

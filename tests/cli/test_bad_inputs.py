@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from egvs.artefacts.checksums import add_checksum
+from egvs.cli import options
+from egvs.core.errors import InputError
 from tests.conftest import BUILDING, collection, fcd, feature
 
 Change = Callable[[Path], object]
@@ -334,6 +336,15 @@ COMMANDS = {
     "--count 0": (["place", "{mini}", "--count", "0"], r"^egvs: --count: expected at least 1 sensor, got 0"),
     "--count -1": (["place", "{mini}", "--count", "-1"], r"^egvs: --count: expected at least 1 sensor, got -1"),
     "--budget 0": (["place", "{mini}", "--budget", "0"], r"^egvs: --budget: expected a cost above 0, got 0"),
+    "--out of a page": (
+        ["explore", "{mini}", "--out", "page.html"],
+        r"^egvs: --out: expected the folder of the run, got page.html. .*, use egvs explore --to page.html.$",
+    ),
+    "--budget 30.000": (
+        ["place", "{mini}", "--budget", "30.000"],
+        r"^egvs: --budget: 30.000 can be 30 or 30000. Write 30 or 30000.$",
+    ),
+    "--surroundings 1,500": (["new", "{out}", "--osm", "x", "--surroundings", "1,500"], r"1,500 can be 1.5 or 1500"),
     "--reach in per cent": (["place", "{mini}", "--reach", "95"], r"^egvs: --reach: .* got 95. Use 0.95 for 95 %"),
     "--reach below 0": (["place", "{mini}", "--reach", "-1"], r"^egvs: --reach: .* got -1. Use a share such as 0.95"),
     "--set without value": (["run", "{mini}", "--set", "roi.voxel_m"], r"--set roi.voxel_m: expected KEY=VALUE"),
@@ -386,6 +397,10 @@ COMMANDS = {
     "--at no place": (
         ["new", "{out}", "--osm", "x.osm", "--at", "here"],
         r"--at: expected LAT,LON in degrees, got 'here'",
+    ),
+    "--at with decimal commas, in two words": (
+        ["new", "{out}", "--download", "--at", "152,2724", "-8,0405"],
+        r"--at: expected LAT,LON within 85 and 180 degrees, got 152.2724,-8.0405",
     ),
     "--surroundings beyond the Earth": (
         ["new", "{out}", "--osm", "x.osm", "--surroundings", "1e300"],
@@ -496,3 +511,15 @@ def test_an_empty_set_of_features_is_a_world_of_ground_alone(mini: Path, tmp_pat
     (mini / "statics.geojson").write_text(json.dumps({"type": "FeatureCollection", "crs": None, "features": []}))
     code, _, error = run_egvs("statics", mini, "--out", tmp_path / "out")
     assert code == 0, error
+
+
+@pytest.mark.parametrize("separator", [",", " ", ", ", ";", " ; ", "\t"])
+@pytest.mark.parametrize("point", [".", ","])
+def test_understands_point(point: str, separator: str) -> None:
+    assert options.latitude_and_longitude(f"52{point}2724{separator}8{point}0405") == (52.2724, 8.0405)
+
+
+@pytest.mark.parametrize("text", ["", "52.2724", "52,2724,8", "52.2724 8.0405 3", "N52 E8", "52,27,24 8"])
+def test_rejects_point(text: str) -> None:
+    with pytest.raises(InputError, match=r"--around: expected LAT,LON in degrees, got .*Use coordinates such as"):
+        options.latitude_and_longitude(text, "--around")

@@ -62,6 +62,7 @@ def test_scenario_accepts_all_kinds():
         ("pedestrian", (0.8, 0.6, 1.73), 0, False, "pedestrian"),
         ("bicycle", (1.76, 0.6, 1.73), 0, False, "bicycle"),
         ("custom1", (5.9, 2.0, 2.5), 0, False, "van"),
+        ("passenger", (12.0, 2.55, 3.1), 0, False, "bus"),
         ("custom1", (16.0, 2.5, 3.8), 0, False, "truck"),
     ],
 )

@@ -407,3 +407,27 @@ def test_mesh_in_feet_is_converted_to_metres(tmp_path: Path, run_egvs) -> None:
     np.testing.assert_allclose(
         np.ptp(vertices_m, axis=0), 20 * 0.3048, atol=0.1
     )  # turned from true north to the grid's
+
+
+def test_lists_junctions_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, printed, progress = run_egvs("new", "--from", SMALL, "--list")
+    assert code == 0, progress
+    row = next(line.split() for line in printed.splitlines() if "East Street" in line)
+    assert row[:4] == ["52.00000,10.00000", "4", "4", "yes"]
+    assert [line.split(maxsplit=2)[2] for line in progress.splitlines()] == [
+        "opens the maps", "reads the roads", "lists the junctions"
+    ]  # fmt: skip
+    assert not list(tmp_path.iterdir())
+    assert run_egvs("new", "--list", "--from", SMALL, "--at", "52.0,10.0")[0] == 2
+    assert "FOLDER: no folder is given" in run_egvs("new", "--from", SMALL)[2]
+    assert "no map is given" in run_egvs("new", "--list")[2]
+
+
+def test_roads_without_buildings_and_trees_assume_open_surroundings(tmp_path: Path) -> None:
+    roads = SMALL.read_text().replace('k="building', 'k="was_building').replace('v="tree', 'v="former_tree')
+    (tmp_path / "roads.osm").write_text(roads)
+    for name, is_assumed in ((SMALL, False), (tmp_path / "roads.osm", True)):
+        create_scenario(tmp_path / f"out_{is_assumed}", name)
+        assumed = loading.load(tmp_path / f"out_{is_assumed}").assumed
+        assert ("surroundings (no building or tree is known)" in assumed) is is_assumed

@@ -70,6 +70,7 @@ def scores(folder: Path) -> list[float]:
         ("A format of point clouds", 2),
         ("A format of recorded tracks", 2),
         ("A score", 1),
+        ("A score that ranks", 1),
         ("A command", 1),
         ("A section of the report", 1),
     ],
@@ -209,6 +210,17 @@ def test_a_score_of_another_package_is_listed(tmp_path: Path) -> None:
     assert code == 0 and "near_points" in text and "within_m 20, 50" in text and "package egvs-near-points" in text, (
         text
     )
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_a_score_of_another_package_ranks(mini: Path, tmp_path: Path) -> None:
+    beside = install(package("A score that ranks"), tmp_path / "installed")
+    words = ("--out", tmp_path / "run", "--set", "score.rank_by=half_seen")
+    code, text = run_egvs("run", mini, *words, beside=beside)
+    assert code == 0 and "half_seen" in text, text
+    code, text = run_egvs("scores", beside=beside)
+    assert code == 0 and "package egvs-half-seen" in text, text
 
 
 @pytest.mark.system

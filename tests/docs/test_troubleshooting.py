@@ -126,7 +126,7 @@ def test_command_prints_the_quoted_message(
 @pytest.mark.slow
 def test_run_prints_the_quoted_messages(mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     folder = tmp_path / "run"
-    code, out, error = run_egvs("run", mini, "--out", folder, "--set", "roi.center_m=[20,60,2.5]")
+    code, out, error = run_egvs("run", mini, "--verbose", "--out", folder, "--set", "roi.center_m=[20,60,2.5]")
     assert code == 0, error
     assert quoted("no vehicle ever enters the region").search(out + error)
 

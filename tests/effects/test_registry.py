@@ -6,15 +6,18 @@ import json
 import shutil
 from pathlib import Path
 from subprocess import CompletedProcess
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import egvs
 from egvs.core.errors import MissingBackendError, RunError
-from egvs.effects import registry, returns
+from egvs.effects import base, registry
 from egvs.effects.base import Detect
 from egvs.scenario.effects_config import EffectParameters
+from egvs.sensors import beam_hooks
+from egvs.traffic.vehicle_boxes import VehicleBoxes, checked_boxes
 from tests import processes
 from tests.core.test_plugins import install, site  # noqa: F401  the fixture
 from tests.effects.detect_helpers import ACTIVE
@@ -217,13 +220,51 @@ class Given(Detect[EffectParameters]):
 )
 def test_rejects_invalid_shares(given: object, result: str) -> None:
     with pytest.raises(RunError, match=rf"^effects\.given: expected one share from 0 to 1 .*, got {result}$"):
-        returns.checked_shares(Given(EffectParameters()), given, 2, "crossings")
+        base.checked_shares(Given(EffectParameters()), given, 2, "crossings")
 
 
 def test_accepts_empty_and_boolean_shares() -> None:
     effect = Given(EffectParameters())
-    assert returns.checked_shares(effect, np.ones(0), 0, "ranges").size == 0
-    assert returns.checked_shares(effect, np.array([True, False]), 2, "ranges").tolist() == [True, False]
+    assert base.checked_shares(effect, np.ones(0), 0, "ranges").size == 0
+    assert base.checked_shares(effect, np.array([True, False]), 2, "ranges").tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("given", "result"),
+    [
+        (None, "NoneType"),
+        ((np.ones((4, 3)), np.zeros(4, int)), "tuple"),
+        ((np.ones((4, 3)), np.zeros(4, int), np.ones(3)), r"shapes \(4, 3\), \(4,\) and \(3,\)"),
+        ((np.ones((4, 2)), np.zeros(4, int), np.ones(4)), r"shapes \(4, 2\), \(4,\) and \(4,\)"),
+        ((np.ones((4, 3)), np.full(4, 2), np.ones(4)), "parents of other beams"),
+        ((np.ones((4, 3)), np.zeros(4), np.ones(4)), "parents of other beams"),
+    ],
+)
+def test_rejects_invalid_sub_beams(given: object, result: str) -> None:
+    with pytest.raises(RunError, match=rf"^effects\.given: expected directions \(m, 3\).* of 2 beams, got {result}$"):
+        beam_hooks.checked_sub_beams(Given(EffectParameters()), given, 2)
+
+
+@pytest.mark.parametrize(
+    ("given", "result"), [(None, "got NoneType"), ("short", r"expected x_m of shape \(1,\), got \(0,\)")]
+)
+def test_rejects_invalid_boxes(given: str | None, result: str) -> None:
+    one, none = np.ones(1), np.ones(0)
+    boxes = VehicleBoxes(0, 1, one, ["a"], one, ["passenger"], one, none, *[one] * 8)
+    with pytest.raises(RunError, match=rf"^Given: .*{result}$"):
+        checked_boxes(Given(EffectParameters()), given and boxes)
+
+
+def test_effect_with_a_number_for_all_ranges_is_named_before_a_run() -> None:
+    class Constant(Given):
+        def detect(self, range_m: object, sensor: object) -> float:
+            return 0.5
+
+    sensors = SimpleNamespace(used_sensors={"a": None})
+    with pytest.raises(
+        RunError, match=r"^effects\.given: expected one share from 0 to 1 for each of 1 ranges, got float$"
+    ):
+        Constant(EffectParameters()).refusal(sensors)
 
 
 @pytest.mark.slow

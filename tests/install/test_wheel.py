@@ -123,6 +123,7 @@ def test_demo_ranks_sites_and_equals_checkout(installed: Installed, tmp_path: Pa
 def test_commands_work_or_name_their_extra(installed: Installed, wheel: Path) -> None:
     shutil.copyfile(EXTRACT, installed.work / "extract.osm")
     runs = installed.work / "runs" / "myplace"
+    assert "checked 13 sites" in installed.egvs("check", "nishishinjuku").stdout  # a shipped scenario, by name
     installed.egvs("new", "myplace", "--osm", "extract.osm")
     installed.egvs("run", "myplace", *FEW, "--out", "runs/myplace")
     installed.egvs("place", "runs/myplace", "--count", "2")

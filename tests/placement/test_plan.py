@@ -17,7 +17,9 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_tpog
 from egvs.drawing import svg_figures
+from egvs.placement import problem_builder
 from egvs.scoring.egvs import EntropyField
+from egvs.sensors.sites import candidate_sites
 
 SITES = """site,x_m,y_m,z_m,cost
 a,10,12,3,
@@ -167,6 +169,16 @@ def test_budget_pays_each_pole_once_and_forced_sensors_never(five_candidates: Pa
     assert (rows[0]["site"], rows[0]["forced"], rows[0]["cost"]) == ("a", True, 0.0)
     assert rows[1]["site"] == "c"
     assert plan["cost"] == 70.0
+
+
+def test_poles_that_exist_are_free_and_have_known_names(five_candidates: Path) -> None:
+    costs = ["costs.sensor.small=20", "costs.pole=50", "costs.metre=1", "sites.existing_poles=['a', 'b']"]
+    scenario = egvs.load(five_candidates, costs)
+    cost, pole_cost = problem_builder.candidate_costs(scenario, candidate_sites(scenario))
+    assert cost.tolist() == [23.0, 23.0, 25.0, 70.0, 74.0]
+    assert pole_cost.tolist() == [0.0, 0.0, 0.0, 0.0, 50.0]
+    with pytest.raises(egvs.InputError, match=r"sites\.existing_poles: there is no site 'b_high'"):
+        candidate_sites(egvs.load(five_candidates, ["sites.existing_poles=['b_high']"]))
 
 
 @pytest.mark.slow
@@ -532,3 +544,20 @@ def test_says_that_time_limit_was_reached(three_candidates: Path, tmp_path: Path
             "place", three_candidates, "--out", tmp_path / "out", "--count", 2, "--exact", "--time-limit", "9s"
         )
         assert ("--exact reached its --time-limit of 9s" in text) is has_note
+
+
+def test_rule_that_forbids_one_more_is_named(five_candidates: Path, out: Path, run_egvs) -> None:
+    """Three candidates at two poles, one sensor for each pole: the explorer recommends no third one either."""
+    rules = ("--set", "placement.most_per_pole=1", "--set", "placement.excluded=['c', 'd']")
+    assert run_egvs("run", five_candidates, "--out", out, *rules)[0] == 0
+    code, text, error = run_egvs("place", five_candidates, "--out", out, "--count", 3, *rules)
+    assert code == 0, error
+    assert "most_per_pole = 1 forbids a third sensor beside them." in text and "adds nothing" not in text
+    assert "most_per_pole = 1 forbids a third sensor beside them." in (out / "report.html").read_text()
+    plan = egvs.open_session(out).plan
+    assert plan is not None and len(plan.sites) == 2
+    assert (plan.best_next, plan.forbids_more) == (None, "most_per_pole = 1")
+
+    apart = ("--set", "placement.least_distance_m=1000")
+    _, text, _ = run_egvs("place", five_candidates, "--out", out / "apart", "--count", 3, *apart)
+    assert "least_distance_m = 1000 forbids a second sensor beside it." in text

@@ -142,6 +142,20 @@ def test_sensor_that_meets_requirements_is_useful() -> None:
     )
 
 
+def test_names_the_rule_that_forbids_one_more() -> None:
+    three = with_sites(steps_of(0.80, 0.90, 0.90), "a", "ab", "ab")
+    rule = "most_per_pole = 1 forbids a third sensor beside them."
+    assert describe_count(three, FOUND, forbids_more="most_per_pole = 1") == (
+        "A second sensor adds 10.0 percentage points to the share of vehicles found: 90.0 %, against 80.0 % with one. "
+        + rule
+    )
+    assert describe_count(three[:1], FOUND, forbids_more="a and b") == "a and b forbid a second sensor beside it."
+    worst = describe_count(three, FOUND, objective="the worst period", forbids_more="most_per_pole = 1")
+    assert worst.endswith(f"the plan maximises the worst period. {rule}")
+    plan = replace(plan_of(three[:2], sensors=2, candidates=4), forbids_more="most_per_pole = 1")
+    assert next_count(plan) is None
+
+
 def test_other_objective_has_no_verdict() -> None:
     answer = describe_count(steps_of(0.848, 0.834), FOUND, objective="the score in the worst period", next_count=3)
     assert answer == (

@@ -94,6 +94,11 @@ def test_column_cost_replaces_the_price(text: str, cost: float | None) -> None:
     assert site_cost(own, CostsConfig(sensor=PRICES)) == cost
 
 
+@pytest.mark.parametrize(("existing", "cost"), [((), 4500.0), (("b",), 4500.0), (("a",), 4000.0), ("all", 4000.0)])
+def test_pole_that_exists_costs_nothing(existing: tuple[str, ...], cost: float) -> None:
+    assert site_cost(site("a", "small", 0.6), CostsConfig(sensor=PRICES, pole=500.0), existing) == cost
+
+
 def test_independent_errors_are_added_in_quadrature() -> None:
     difference = ScoreDifference.of_independent(site("a", "s", 0.65, se=0.03), site("b", "s", 0.6, se=0.04))
     assert difference.se == pytest.approx(0.05)

@@ -234,6 +234,7 @@ KEYS: dict[str, Change] = {
     "sites.pitch_deg": Change("-10"),
     "sites.roll_deg": Change("5"),
     "sites.mount": Change("'inverted'"),
+    "sites.existing_poles": Change("'all'", BUDGET),
     "sensors.*.elevations_deg": Change("[-20, 5]"),
     "sensors.*.channels": Change("4"),
     "sensors.*.azimuth_offsets_deg": Change("[0, 1, 0, 1, 0, 1, 0, 1]"),
@@ -425,9 +426,9 @@ def outcome(key: str, small: Path, file: str, overrides: tuple[str, ...]) -> obj
     scenario = load(small / file, overrides)
     run_folder = small / ("run_of_periods" if scenario.traffic.periods else "run")
     match key.partition(".")[0]:
-        case "sites":
+        case "sites" if key != "sites.existing_poles":  # these change costs only
             return Inputs(scenario).plain_scene.sites
-        case "costs" | "placement":
+        case "costs" | "placement" | "sites":
             placed = solve_placement(open_folder(scenario, run_folder), exact=True, time_limit_s=60)
             return placed.sensors, placed.joint, placed.cost, placed.zones, [step.cost for step in placed.curve]
         case "what_if":

@@ -6,6 +6,8 @@ wrong use with its message."""
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
 
@@ -19,13 +21,14 @@ from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import read_frames
 from egvs.core.errors import InputError, collect_warnings
 from egvs.scenario import loading
-from egvs.scenario.score_config import VEHICLE_SCORES, RankingScore, ScoreConfig
+from egvs.scenario.score_config import SCORES_GROUP, VEHICLE_SCORES, RankingScore, ScoreConfig
 from egvs.scoring.egvs import binary_entropy
 from egvs.scoring.target_scores import TARGET_SCORES, expected_detections
 from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.stages import score
+from tests.core.test_plugins import clear_caches, install
 from tests.scoring import target_scenes as scenes
 from tests.stage_runner import inputs_of, run_stage
 
@@ -237,7 +240,7 @@ def test_additional_scores_are_unique() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("score.rank_by=detections", "score.rank_by: expected 'egvs'"),
+        ("score.rank_by=detections", "score.rank_by: expected one of egvs"),
         ('score.others=["egvs"]', "score.others.0: expected 'expected_detections'"),
         ('score.others=["seen_well","seen_well"]', "seen_well is listed twice"),
     ],
@@ -283,3 +286,83 @@ def test_the_expected_detections_are_those_of_the_calibration(mini: Path, tmp_pa
     for site in scanner.scene.sites:
         seen = visible_targets(record, Beams.of(scanner.scan_site(site)))
         assert rows[site.name]["expected_detections"] == expected_detections(seen)
+
+
+VEHICLE_SCORE = """
+from egvs.scoring.target_scores import VehicleScore
+
+MY_SCORE = VehicleScore("my_score", "n / (n + 5)", "an example", lambda seen: seen.points / (seen.points + 5.0))
+WRONG = VehicleScore("wrong", "", "", lambda seen: seen.points + 2.0)
+OF_SITES = "a score of sites"
+"""
+PERIODS = 'traffic.periods=[{name="a", length_s=12}, {name="b", begin_s=12, length_s=8}]'
+
+
+@pytest.fixture
+def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A package of somebody else with scores."""
+    entries = "my_score = plug_score:MY_SCORE\nwrong = plug_score:WRONG\nof_sites = plug_score:OF_SITES"
+    install(tmp_path / "site", "somebody-elses", entries, {"plug_score": VEHICLE_SCORE}, SCORES_GROUP)
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    clear_caches()
+    yield
+    clear_caches()
+    sys.modules.pop("plug_score", None)
+
+
+@pytest.mark.parametrize("periods", [(), (PERIODS,)], ids=["no periods", "periods"])
+def test_ranks_and_plans_by_the_score_of_a_plugin(
+    mini: Path, tmp_path: Path, plugin: None, periods: tuple[str, ...], run_egvs
+) -> None:
+    (mini / "sites.csv").write_text(SITES)
+    words = [word for setting in ("score.rank_by=my_score", *periods) for word in ("--set", setting)]
+    out = tmp_path / "out"
+    code, printed, error = run_egvs("run", mini, "--out", out, *words)
+    assert code == 0, error
+    assert "my_score" in printed and "the score my_score" in (out / "report.html").read_text()
+
+    scenario = loading.load(mini, ["score.rank_by=my_score", *periods])
+    record = TargetRecord.read(out / "trajectories.parquet", scenario.roi.grid, 40)
+    scanner = Scanner(egvs.build_scene(scenario))
+    chances = {}
+    for candidate in scanner.scene.sites:
+        points = visible_targets(record, Beams.of(scanner.scan_site(candidate))).points
+        chances[candidate.name] = points / (points + 5.0)
+    rows = {row["site"]: row for row in read_scores(out / "scores.parquet").to_pylist()}
+    assert by_rank(rows, "my_score") and all(row["my_score_se"] > 0 for row in rows.values())
+    if periods:  # the mix is between the periods
+        by_period = read_scores_by_period(out / "scores_by_period.parquet").to_pylist()
+        for name, row in rows.items():
+            of_site = [other["my_score"] for other in by_period if other["site"] == name]
+            assert len(of_site) == 2 and min(of_site) <= row["my_score"] <= max(of_site)
+    else:
+        for name, chance in chances.items():
+            assert rows[name]["my_score"] == pytest.approx(chance.mean(), rel=1e-12)
+        joint = egvs.JointScore.of(scenario, out)
+        joint.add("s1", "s2")
+        assert joint.value == pytest.approx((1 - (1 - chances["s1"]) * (1 - chances["s2"])).mean(), rel=1e-9)
+    code, printed, error = run_egvs("place", out, "--count", "2")
+    assert code == 0, error
+    assert "independently" in printed
+    assert run_egvs("verify", out)[0] == 0
+    rated = egvs.open_session(out).rate("s1", scanner.scene.sites[1].pose)
+    assert rated.scores["my_score"] == pytest.approx(rows["s1"]["my_score"], rel=1e-12)
+    compared = egvs.compare_runs([out, out])
+    assert compared is not None
+
+
+def test_wrong_scores_of_plugins_are_named(mini: Path, tmp_path: Path, plugin: None, run_egvs) -> None:
+    message = r"score\.rank_by: expected one of egvs, .*my_score, of_sites, wrong, got 'my_scor'"
+    with pytest.raises(InputError, match=message):
+        loading.load(mini, ["score.rank_by=my_scor"])
+    with pytest.raises(
+        InputError, match=r"score\.rank_by.*'density'"
+    ):  # it gives a number for a site, none for vehicles
+        loading.load(mini, ["score.rank_by=density"])
+    for name, text in (
+        ("of_sites", "only a egvs.scoring.target_scores.VehicleScore can rank sites, got a str"),
+        ("wrong", "score wrong: expected 76 numbers from 0 to 1, got values from"),
+    ):
+        code, _, error = run_egvs("run", mini, "--out", tmp_path / name, "--set", f"score.rank_by={name}")
+        assert (code, text in error) == (1, True), error
+        assert not (tmp_path / name / "scores.parquet").exists()

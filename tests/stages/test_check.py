@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -50,6 +51,24 @@ def statics(folder: Path, *features: dict) -> None:
 def test_valid_scenario_has_no_finding(street: Path, mini: Path) -> None:
     checked = check.check_scenario(egvs.load(street))
     assert (checked.findings, checked.sites, checked.solids, checked.lanes) == ((), 2, 3, 2)
+
+
+def test_says_where_each_pole_stands(street: Path) -> None:
+    """Lanes are 3.2 m wide and meet at y = 0; the building is at x 14 to 18 m, y 5 to 8 m."""
+    sites(street, "beside,10,12,3", "high,10,12,5", "inside,30,1.2,8", "far,16,40,3")
+    poles = {pole.pole: pole for pole in check.check_scenario(egvs.load(street)).poles}
+    assert list(poles) == ["beside", "inside", "far"]
+    assert poles["beside"].kerb_m == pytest.approx(12 - 3.2)
+    assert poles["beside"].wall_m == pytest.approx(math.hypot(4, 4))
+    assert poles["inside"].kerb_m == pytest.approx(2.0)
+    assert poles["far"].wall_m == pytest.approx(32.0)
+    lone, *_ = check.check_scenario(egvs.load(street, ["statics.footprints=[]"])).poles
+    assert math.isnan(lone.wall_m)
+
+
+def test_pole_without_network_and_walls_has_no_distances(mini: Path) -> None:
+    lone, *_ = check.check_scenario(egvs.load(mini, ["statics.footprints=[]"])).poles
+    assert (lone.where, math.isnan(lone.kerb_m), math.isnan(lone.wall_m)) == ("", True, True)
 
 
 def test_no_lane_rule_applies_without_network(mini: Path) -> None:
@@ -431,10 +450,11 @@ def test_warns_about_a_rated_range_without_its_reflectivity(street: Path) -> Non
 def test_check_command_without_findings_writes_nothing(street: Path, run_egvs) -> None:
     before = sorted(street.rglob("*"))
     code, printed, _ = run_egvs("check", street)
-    assert (code, printed.splitlines()) == (
-        0,
-        ["no errors or warnings", "checked 2 sites, 3 solids and 2 lanes"],
-    )
+    _, *poles, _, verdict, counts = printed.splitlines()
+    assert (code, verdict, counts) == (0, "no errors or warnings", "checked 2 sites, 3 solids and 2 lanes")
+    assert [line.split()[:5] for line in poles] == [
+        ["pole_a", "10.0", "12.0", "8.8", "5.7"], ["pole_b", "30.5", "-12.0", "8.8", "21.1"],
+    ]  # fmt: skip
     assert sorted(street.rglob("*")) == before
 
 

@@ -34,6 +34,7 @@ from egvs.cli.options import (
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
+    from egvs.creation.new_scenario import NewScenarioOptions
     from egvs.scenario.model import Scenario
     from egvs.studies.effect_study import EffectStatus
 
@@ -161,17 +162,18 @@ def check(
     scenario: SettingsPath,
     set_: Set = None,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Also print what protects this machine from the scenario's files.")
+        bool,
+        typer.Option("--verbose", help="Print all poles, and what protects this machine from the scenario's files."),
     ] = False,
 ) -> None:
-    """Check a scenario before a run, and print all errors and warnings. No files are written."""
+    """Check a scenario before a run: print where the poles stand, all errors and warnings. No files are written."""
     from egvs.cli import run_tables
     from egvs.core import sandbox
     from egvs.runs.run_sources import SettingsSource
     from egvs.stages import check
 
     checked = check.check_scenario(SettingsSource.of(scenario, set_).load())
-    run_tables.print_check(checked)
+    run_tables.print_check(checked, with_details=verbose)
     if verbose:
         run_tables.print_protections(sandbox.missing_protections())
     if checked.errors:
@@ -589,7 +591,9 @@ def sensors(
 
 @app.command(cls=cli_options.NewCommand)
 def new(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the new scenario.")],
+    folder: Annotated[
+        Path | None, typer.Argument(metavar="FOLDER", help="Folder of the new scenario; not with --list.")
+    ] = None,
     more: Annotated[
         list[Path] | None, typer.Argument(metavar="[FILE]...", help="Further map files or folders.")
     ] = None,
@@ -735,6 +739,12 @@ def new(
             " height from it.",
         ),
     ] = None,
+    list_: Annotated[
+        bool,
+        typer.Option(
+            "--list", help="List the junctions of the road map: names, arms, signals, --at. Nothing is written."
+        ),
+    ] = False,
     run_: Annotated[
         bool, typer.Option("--run", help="Run the new scenario at once, as egvs run does, up to the ranking.")
     ] = False,
@@ -749,6 +759,19 @@ def new(
     from egvs.creation.new_scenario import NewScenarioOptions
 
     paths = [*(maps or []), *(more or [])]
+    if list_:
+        others = {
+            "--at": at, "--download": download, "--surroundings": surroundings, "--traffic": traffic, "--run": run_,
+            "--vehicles-per-hour": vehicles_per_hour, "--counts": counts, "--poles": poles, "--tracks": tracks,
+            "--like": like, "--signals": signals, "--align": align, "--surface": surface,
+        }  # fmt: skip
+        for option in filter(others.get, others):
+            raise InputError(option, "has no effect with --list", "Remove one of them.")
+        maps_given = [*(maps or []), *([folder] if folder else []), *(more or [])]  # --from A B takes B for the folder
+        _list_junctions(maps_given, NewScenarioOptions(lefthand=lefthand, righthand=righthand, walk=walk))
+        return
+    if folder is None:
+        raise InputError("FOLDER", "no folder is given", "Name the folder of the new scenario, or use --list.")
     if not paths and not download:
         hint = "Give a map of the roads, such as --from town.osm, or --at LAT,LON --download."
         raise InputError("--from", "no map is given", hint)
@@ -791,6 +814,18 @@ def new(
     new_summary.print_new_scenario(scenario, notes)
     if run_:
         run(folder)
+
+
+def _list_junctions(paths: Sequence[Path], options: NewScenarioOptions) -> None:
+    from egvs.cli import new_summary
+    from egvs.cli.console import ProgressDisplay
+    from egvs.creation.new_scenario import list_junctions
+
+    if not paths:
+        raise InputError("--from", "no map is given", "Give a map of the roads, such as --from town.osm.")
+    with ProgressDisplay("new", prints_progress=True) as screen:
+        listed = list_junctions(paths, options, screen.progress)
+    new_summary.print_junctions(listed)
 
 
 @app.command()

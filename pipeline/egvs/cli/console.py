@@ -5,8 +5,10 @@ Results go to standard output; progress, stage lines and warnings go to standard
 
 from __future__ import annotations
 
+import math
 import sys
 import textwrap
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
@@ -33,6 +35,9 @@ LINE_WIDTH = 100
 
 _WARNING_LINES = 2
 """Lines of the most serious warning, unless all details are printed."""
+
+LINE_INTERVAL_S = 5.0
+"""Least time between two lines about the progress of one step."""
 
 Row = TypeVar("Row")
 
@@ -176,6 +181,9 @@ class ProgressDisplay:
     is_run
         Whether unchanged stages have a line, and their warnings are reported like those of others; otherwise only their
         number is printed.
+    prints_progress
+        Whether progress is printed where there is no terminal: a line for each new step, else every
+        :data:`LINE_INTERVAL_S`.
 
     Attributes
     ----------
@@ -187,7 +195,9 @@ class ProgressDisplay:
         What the simulated flows are compared with; set by commands that know the scenario.
     """
 
-    def __init__(self, verb: str = "", *, with_details: bool = False, is_run: bool = False) -> None:
+    def __init__(
+        self, verb: str = "", *, with_details: bool = False, is_run: bool = False, prints_progress: bool = False
+    ) -> None:
         self.any_stage_ran = False
         self.warning_lines = 0
         self.flow_source = stage_summary.FLOWS
@@ -208,6 +218,9 @@ class ProgressDisplay:
         )
         self._task = self._bar.add_task(verb, total=None)
         self._has_bar = sys.stderr.isatty()
+        self._prints_progress = prints_progress and not self._has_bar
+        self._begin_s = time.monotonic()
+        self._last_line = ("", -math.inf)
 
     def __enter__(self) -> ProgressDisplay:
         if self._has_bar:
@@ -237,11 +250,20 @@ class ProgressDisplay:
 
     def progress(self, what: str, done: int, total: int) -> None:
         """Move the bar; a :data:`egvs.core.progress.ProgressCallback`."""
+        if self._prints_progress:
+            self._print_progress(what, done, total)
         if not self._has_bar:
             return
-        count = f"{done}/{total}" if total else str(done)
+        count = f"{done}/{total}" if total else str(done or "")
         self._bar.update(self._task, description=f"{self._part}{self._stage}: {what} {count}", completed=done)
         self._bar.tasks[0].total = total or None  # update() takes None for "unchanged"
+
+    def _print_progress(self, what: str, done: int, total: int) -> None:
+        now_s = time.monotonic() - self._begin_s
+        if what == self._last_line[0] and now_s - self._last_line[1] < LINE_INTERVAL_S:
+            return
+        self._last_line = (what, now_s)
+        self.say(f"{now_s:4.0f} s  {what} {f'{done}/{total}' if total else done or ''}".rstrip())
 
     def begin_part(self, title: str) -> None:
         """Begin one of several runs of a command: its stages are shown on the bar only, after the title."""

@@ -10,11 +10,11 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from egvs.cli.console import console
+from egvs.cli.console import Column, console, print_table
 from egvs.core.wording import list_first, number_of
 from egvs.creation import junctions
 from egvs.creation.map_parts import OUT_OF_RANGE, ImportCounts
-from egvs.creation.new_scenario import NewScenario
+from egvs.creation.new_scenario import ListedJunction, NewScenario
 from egvs.creation.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
 from egvs.scenario.model import SCENARIO_FILE
 
@@ -38,6 +38,19 @@ def print_new_scenario(scenario: NewScenario, map_notes: Sequence[str] = ()) -> 
     if scenario.attributions:
         out.print(f"Map data {'; '.join(scenario.attributions)}")
     out.print(f"next: egvs run {scenario.folder}")
+
+
+def print_junctions(listed: Sequence[ListedJunction]) -> None:
+    """Print a table of junctions."""
+    columns: list[Column[ListedJunction]] = [
+        Column("--at", lambda junction: junction.at, "left"),
+        Column("arms", lambda junction: str(junction.arms)),
+        Column("lanes in", lambda junction: str(junction.lanes_in)),
+        Column("signals", lambda junction: "yes" if junction.signalised else "-", "left"),
+        Column("junction", lambda junction: junction.title, "left", wrap=True),
+    ]
+    print_table(columns, listed, file_width=_FILE_WIDTH)
+    print(f"{number_of(len(listed), 'junction')}; egvs new FOLDER --from ... --at LAT,LON makes a scenario of one")
 
 
 def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:

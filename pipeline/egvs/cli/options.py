@@ -15,17 +15,33 @@ from typer.core import TyperCommand
 from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan
 
-ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario folder, or its scenario.toml.")]
+ScenarioPath = Annotated[
+    Path,
+    typer.Argument(
+        metavar="SCENARIO", help="Scenario folder, or its scenario.toml; or a shipped scenario, e.g. nishishinjuku."
+    ),
+]
 SettingsPath = Annotated[
     Path,
     typer.Argument(metavar="SCENARIO|RUN", help="Scenario folder or its scenario.toml, or a run, to use its settings."),
 ]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
+
+
+def _check_folder_name(folder: Path | None) -> Path | None:
+    """Raise an InputError for the name of a page in place of a run folder."""
+    if folder is not None and folder.suffix.lower() in (".html", ".htm"):
+        problem = f"expected the folder of the run, got {folder}"
+        raise InputError("--out", problem, f"For one page with the 3D view, use egvs explore --to {folder}.")
+    return folder
+
+
 Out = Annotated[
     Path | None,
     typer.Option(
         "--out",
         metavar="DIR",
+        callback=_check_folder_name,
         help="Folder of the run; by default runs/<scenario name>, with --set runs/<scenario name>@<what differs>.",
     ),
 ]
@@ -126,13 +142,43 @@ def parse_host_and_port(text: str) -> tuple[str, int]:
 
 
 def latitude_and_longitude(text: str, option: str = "--at") -> tuple[float, float]:
-    """Return latitude and longitude in degrees from LAT,LON."""
+    """Return latitude and longitude in degrees from LAT,LON, also from "LAT LON" and with decimal commas.
+
+    Examples
+    --------
+    >>> latitude_and_longitude("52.2724,8.0405"), latitude_and_longitude("52,2724 8,0405")
+    ((52.2724, 8.0405), (52.2724, 8.0405))
+    """
+    words = re.split(r"[\s;]+", text.strip())
+    if len(words) == 2:
+        words = [word.removesuffix(",").replace(",", ".") for word in words]
+    else:
+        words = text.split(",")
+        if len(words) == 4:  # decimal commas, and one between the numbers
+            words = [".".join(words[:2]), ".".join(words[2:])]
     try:
-        latitude_deg, longitude_deg = (float(part) for part in text.split(","))
+        latitude_deg, longitude_deg = map(float, words)
     except ValueError:
         problem = f"expected LAT,LON in degrees, got {text!r}"
         raise InputError(option, problem, "Use coordinates such as 50.8704,9.7080.") from None
     return latitude_deg, longitude_deg
+
+
+def cost(text: str) -> float:
+    """Return the cost of ``--budget``."""
+    _check_separators(text, "--budget")
+    amount = _parse_quantity(text, {"": 1.0})
+    if not 0 < amount < math.inf:
+        raise InputError("--budget", f"expected a cost above 0, got {text[:80]}", "Use the total, such as 20000.")
+    return amount
+
+
+def _check_separators(text: str, option: str) -> None:
+    """Raise an InputError where a point or comma can separate thousands or decimals, as in 30.000."""
+    if re.fullmatch(r"[1-9][0-9]{0,2}[.,][0-9]{3}[A-Za-z]*", text):
+        short = re.sub(r"\.?0+(?=[A-Za-z]*$)", "", text.replace(",", "."))
+        choices = f"{short} or {re.sub('[.,]', '', text)}"
+        raise InputError(option, f"{text} can be {choices}", f"Write {choices}.")
 
 
 def width_mm(text: str, least: float, most: float) -> float:
@@ -162,6 +208,7 @@ def radius_m(text: str) -> float:
 
     if text == "all":
         return math.inf
+    _check_separators(text, "--surroundings")
     radius = number_or_nan(text)
     if not 0 < radius <= MAX_COORDINATE_M:
         problem = f"expected a length in metres, or all, got {text[:80]!r}"
@@ -182,7 +229,26 @@ _RECORDING_OPTIONS = ("tracks", "like", "pedestrian_tracks", "signals", "track_c
 """Parameters of ``egvs new`` that need an extension."""
 
 
-class NewCommand(TyperCommand):
+class PointCommand(TyperCommand):
+    """A command that accepts ``--at LAT LON`` in two words, also with decimal commas, for ``--at LAT,LON``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Join a point in two words."""
+        words: list[str] = []
+        for arg in args:
+            previous = words[-1].removesuffix(",") if words else ""
+            if words[-2:-1] in (["--at"], ["--around"]) and _is_number(previous) and _is_number(arg):
+                words[-1] += f" {arg}"
+            else:
+                words.append(arg)
+        return super().parse_args(ctx, words)
+
+
+def _is_number(text: str) -> bool:
+    return re.fullmatch(r"[+-]?[0-9]+([.,][0-9]+)?", text) is not None
+
+
+class NewCommand(PointCommand):
     """``egvs new``: accepts ``--poles 20m`` and ``--poles "every 20m"`` for ``--poles every 20m``.
 
     Its help hides options for recordings where no installed extension reads them.
@@ -220,6 +286,7 @@ def _parse_spacing_m(text: str) -> float:
 
 def length_m(text: str, option: str) -> float:
     """Return metres from 1500, 1500m or 2km."""
+    _check_separators(text, option)
     length = _parse_quantity(text, {"m": 1.0, "km": 1000.0, "": 1.0})
     if not 0 < length < math.inf:
         raise InputError(option, f"expected a length above 0, got {text[:80]!r}", "Use a length such as 1500m or 2km.")

@@ -33,7 +33,7 @@ def place(
     out: Out = None,
     count: Annotated[int | None, typer.Option(metavar="K", help="Find the best plan of at most K sensors.")] = None,
     budget: Annotated[
-        float | None, typer.Option(metavar="COST", help="Find the best plan within this total cost (see \\[costs]).")
+        str | None, typer.Option(metavar="COST", help="Find the best plan within this total cost (see \\[costs]).")
     ] = None,
     reach: Annotated[
         float | None,
@@ -59,10 +59,11 @@ def place(
     from egvs.cli.console import ProgressDisplay
 
     limit_s = options.duration_s(time_limit, "--time-limit")
-    _check_request(count, budget, reach)
+    _check_request(count, reach)
+    total_cost = None if budget is None else options.cost(budget)
     overrides = options.with_detector(set_, detector, scenario)
     request = []
-    for key, value in zip(_REQUEST_KEYS, (count, budget, reach), strict=True):
+    for key, value in zip(_REQUEST_KEYS, (count, total_cost, reach), strict=True):
         if value is not None:
             request.append(f"placement.{key}={value!r}")
     loaded, folder = sources.open_source(scenario, overrides, out, request)
@@ -90,12 +91,10 @@ def place(
     print_placement(placed, notes, [caveat for caveat in caveats if caveat])
 
 
-def _check_request(count: int | None, budget: float | None, reach: float | None) -> None:
+def _check_request(count: int | None, reach: float | None) -> None:
     """InputError for an option whose value is out of range."""
     if count is not None and count < 1:
         raise InputError("--count", f"expected at least 1 sensor, got {count}", "Use a number such as 3.")
-    if budget is not None and not 0 < budget < math.inf:
-        raise InputError("--budget", f"expected a cost above 0, got {budget:g}", "Use the total cost, such as 20000.")
     if reach is not None and not 0 < reach <= 1:
         hint = "Use a share such as 0.95."
         if 1 < reach <= 100:

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from egvs.sensors.beam_files import BeamFile
     from egvs.sensors.sensor import Sensor
     from egvs.stages.check import CheckReport
+    from egvs.stages.scene_checks import PoleSurroundings
     from egvs.studies.effect_study import EffectChange, EffectCost, EffectStatus
 
 _RESULT_FILE_WIDTH = 150
@@ -298,9 +299,27 @@ def print_verification(folder: Path, differences: list[str]) -> None:
         out.print(f"{folder}: all artefacts are unaltered, and a second run reproduces them byte for byte")
 
 
-def print_check(checked: CheckReport) -> None:
-    """Print all findings of a check: errors first, grouped by rule."""
+MAX_POLES = 30
+"""Poles that ``egvs check`` lists unless all details are printed."""
+
+
+def print_check(checked: CheckReport, *, with_details: bool = False) -> None:
+    """Print where the poles stand, and all findings of a check: errors first, grouped by rule."""
     out = console(_RESULT_FILE_WIDTH)
+    if checked.poles:
+        columns: list[Column[PoleSurroundings]] = [
+            Column("pole", lambda pole: pole.pole, "left"),
+            Column("x m", lambda pole: f"{pole.x_m:.1f}"),
+            Column("y m", lambda pole: f"{pole.y_m:.1f}"),
+            Column("kerb m", lambda pole: _format_distance(pole.kerb_m)),
+            Column("wall m", lambda pole: _format_distance(pole.wall_m)),
+            Column("stands", lambda pole: pole.where or "-", "left", wrap=True),
+        ]
+        shown = checked.poles if with_details else checked.poles[:MAX_POLES]
+        print_table(columns, shown, file_width=_RESULT_FILE_WIDTH)
+        if hidden := len(checked.poles) - len(shown):
+            out.print(f"{hidden} more poles; --verbose lists them")
+        out.print("kerb: distance to the edge of the carriageway; wall: to the nearest building or other surface")
     for severity, findings in (("error", checked.errors), ("warning", checked.warnings)):
         if not findings:
             continue
@@ -314,6 +333,10 @@ def print_check(checked: CheckReport) -> None:
     if not checked.findings:
         out.print("no errors or warnings")
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
+
+
+def _format_distance(distance_m: float) -> str:
+    return format_or_dash(None if math.isnan(distance_m) else distance_m, ".1f")
 
 
 def print_protections(missing: Sequence[str]) -> None:

@@ -60,13 +60,14 @@ from numpy.typing import NDArray
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.sweeps import LabelledSweep, SiteView, Sweep
-from egvs.core import files
-from egvs.core.errors import InputError
+from egvs.core import files, plugins
+from egvs.core.errors import InputError, MissingBackendError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.effects.base import Echo, Echoes
+from egvs.effects.base import Echo, Echoes, checked_shares
 from egvs.effects.returns import ReturnProbability
 from egvs.formats import meshes
 from egvs.kernels import mesh_casting
+from egvs.scenario.loading import check_is_scenario
 from egvs.scenario.model import Scenario
 from egvs.sensors.return_model import class_of
 from egvs.sensors.scanner import Scanner
@@ -94,6 +95,9 @@ _TRIANGLES_PER_PART = 16
 
 _BY_SIZE = "by size"
 _KEI_LENGTH_M, _KEI_WIDTH_M = 3.4, 1.48  # limits of Japan's class of light vehicles
+BUS_LENGTHS_M = (10.0, 15.0)
+"""A vehicle of unknown class with such a length is a bus; other long vehicles are trucks."""
+
 _ROUNDING = 1e-9
 
 _NOT_DRAWN_M = -1.0
@@ -205,7 +209,7 @@ def _kind_by_size(length_m: float, width_m: float, height_m: float) -> str:
         return "sedan"
     if length_m <= 6.5:
         return "van"
-    return "truck"
+    return "bus" if BUS_LENGTHS_M[0] <= length_m <= BUS_LENGTHS_M[1] else "truck"
 
 
 @cache
@@ -506,8 +510,11 @@ class CloudSimulator:
         sigma_m: float | FloatArray = self.view.sensor.range_sigma_m
         if self._echo_effects:
             echoes = self._echoes(rows, hits, frame)
-            sigma_m = np.sqrt(sigma_m**2 + sum(effect.sigma_m(echoes) ** 2 for effect in self._echo_effects))
-            probability = np.prod([effect.probability(echoes) for effect in self._echo_effects], axis=0)
+            probability, variance_m2 = np.ones(len(rows)), np.zeros(len(rows))
+            for effect in self._echo_effects:
+                probability *= checked_shares(effect, effect.probability(echoes), len(rows), "returns")
+                variance_m2 += checked_shares(effect, effect.sigma_m(echoes), len(rows), "returns", np.inf) ** 2
+            sigma_m = np.sqrt(sigma_m**2 + variance_m2)
             is_kept = rng.random(len(rows)) < probability
             rows, sigma_m = rows[is_kept], sigma_m[is_kept]
         noise = sigma_m * rng.standard_normal(len(rows), dtype=np.float32)
@@ -604,3 +611,57 @@ def _static_surfaces(scanner: Scanner, scan: EmptyScan, directions: FloatArray) 
         world.solid_of_face[scan.face[on_face]]
     ]
     return cosine, reflectivity
+
+
+WRITERS_GROUP = "egvs.cloud_writers"
+"""Entry points of what :func:`write_clouds` calls."""
+
+
+def write_clouds(
+    scenario: Scenario,
+    folder: str | Path,
+    *,
+    sites: Sequence[str] = (),
+    frames: int,
+    spacing_s: float | None = None,
+    kind: str = "kitti",
+    jobs: int | None = None,
+) -> Path:
+    """Write labelled point clouds of a scenario's sites, as ``egvs clouds`` does, and return their folder.
+
+    Parameters
+    ----------
+    scenario
+        From :func:`egvs.load`.
+    folder
+        New or empty; nothing is overwritten. It gets a folder for each site, and a README.
+    sites
+        Names of sites; all by default.
+    frames
+        Number of frames of each site.
+    spacing_s
+        Minimum time between two frames, in seconds; by default 7 s, or what the traffic allows.
+    kind
+        Format: ``"kitti"``, ``"openpcdet"``, ``"ply"`` or ``"pcd"``.
+    jobs
+        Number of threads; one per core when None. The files do not depend on it.
+
+    Raises
+    ------
+    InputError
+        For wrong arguments, and a scenario that a stage refuses; nothing is written then.
+
+    Examples
+    --------
+    >>> import egvs
+    >>> scenario = egvs.load("roundabout", ["traffic.frames=100"])
+    >>> egvs.write_clouds(scenario, "clouds", sites=["kerb_NE"], frames=2).name
+    'clouds'
+    """
+    check_is_scenario(scenario)
+    names = plugins.plugin_names(WRITERS_GROUP)
+    if not names:
+        raise MissingBackendError("write_clouds needs the extension validation, which is not installed.")
+    write = plugins.load_plugin(WRITERS_GROUP, names[0])
+    write(scenario, Path(folder), sites=sites, frames=frames, spacing_s=spacing_s, kind=kind, jobs=jobs)
+    return Path(folder)

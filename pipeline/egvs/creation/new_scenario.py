@@ -35,6 +35,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import by_number, number_of
 from egvs.creation import (
     assumed_traffic,
@@ -54,6 +55,7 @@ from egvs.creation.junctions import JunctionRegion, KerbsidePole, StreetJunction
 from egvs.creation.map_parts import (
     DECK_BASE_M,
     DEFAULT_BUILDING_M,
+    OBJECT_KIND,
     OUT_OF_RANGE,
     ImportCounts,
     MapContext,
@@ -85,7 +87,7 @@ from egvs.creation.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.creation.terrain.relief import Relief, ground_surface
 from egvs.formats.archives import unpack_archives
 from egvs.scenario.loading import load
-from egvs.scenario.model import SCENARIO_FILE
+from egvs.scenario.model import NO_SURROUNDINGS, POLE_POSITIONS, SCENARIO_FILE
 from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
 from egvs.sensors.sensor import CATALOGUE
@@ -465,6 +467,53 @@ def create_scenario(
         _plan_traffic(draft)
         draft.notes = [unpacked.user_text(note) for note in draft.notes]
         return _write_scenario(draft)
+
+
+@dataclass(frozen=True)
+class ListedJunction:
+    """A junction of a map: its description, arms and incoming lanes, signals, and the value of ``--at`` there."""
+
+    title: str
+    arms: int
+    lanes_in: int
+    signalised: bool
+    at: str
+
+
+def list_junctions(
+    maps: Sequence[str | Path], options: NewScenarioOptions | None = None, progress: ProgressCallback = no_progress
+) -> list[ListedJunction]:
+    """Return the junctions of a road map of which a scenario can be made, the largest first; nothing is written.
+
+    Parameters
+    ----------
+    maps
+        As for :func:`create_scenario`.
+    options
+        ``lefthand``, ``righthand`` and ``walk`` are used.
+    progress
+        Called at the beginning of each step.
+
+    Raises
+    ------
+    InputError
+        When a file is damaged or of an unknown format, or the road map has no drivable streets.
+    """
+    options = options or NewScenarioOptions()
+    with unpack_archives([Path(path) for path in maps]) as unpacked:
+        progress("opens the maps", 0, 0)
+        files = map_readers.open_maps(unpacked.paths)
+        progress("reads the roads", 0, 0)
+        road_options = RoadOptions(options.lefthand, options.walk, bool(files.terrain), None, options.righthand)
+        streets = _read_roads(files.roads, road_options).streets
+        progress("lists the junctions", 0, 0)
+        return [
+            ListedJunction(
+                junction.title, junction.arms, junction.lanes_in, junction.signalised,
+                _at_option(streets, junction.at_m),
+            )
+            for junction in junctions.distinct_crossings(streets)
+        ]  # fmt: skip
 
 
 def _open_files(
@@ -1000,7 +1049,15 @@ def _assumptions(draft: _Draft) -> list[str]:
     is_given = draft.demand is not None or draft.plan.is_finished or bool(draft.plan.signal_notes)
     if draft.junction.signalised and not is_given:
         assumed.append(ASSUMED_PLANS)
-    return [*assumed, *draft.plan.assumptions, *assumed_sizes(draft.objects.counts), "positions of the poles"]
+    assumed += [*draft.plan.assumptions, *assumed_sizes(draft.objects.counts)]
+    kinds = {solid.kind for solid in draft.objects.solids} | {mesh.kind for mesh in draft.objects.meshes}
+    if not any(kind.startswith(_SURROUNDINGS) for kind in kinds):
+        assumed.append(NO_SURROUNDINGS)
+    return [*assumed, POLE_POSITIONS]
+
+
+_SURROUNDINGS = ("building", "roof", "tree", "vegetation", "mesh", OBJECT_KIND)
+"""Kinds of solids, or their beginnings, that can hide vehicles; a map without any probably has roads only."""
 
 
 def assumed_sizes(counts: ImportCounts) -> list[str]:

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, RunError
 from egvs.core.wording import format_percent
 from egvs.scenario.effects_config import EffectParameters
 from egvs.sensors.beam_hooks import BeamCutter, BeamExpander
@@ -134,6 +134,28 @@ class Effect(Generic[P]):
         return ()
 
 
+def checked_shares(effect: Effect[Any], shares: object, count: int, unit: str, most: float = 1.0) -> FloatArray:
+    """Return the ``count`` shares of an effect, or other numbers from 0 to ``most``.
+
+    Raises
+    ------
+    RunError
+        For anything else, which would give a wrong score.
+    """
+    if not isinstance(shares, np.ndarray):
+        actual = f"{type(shares).__name__}"
+    elif shares.dtype.kind not in "fiub":
+        actual = f"{type(shares).__name__} of {shares.dtype}"
+    elif shares.shape != (count,):
+        actual = f"an array of shape {shares.shape} for {count} {unit}"
+    elif shares.size and not (shares.min() >= 0 and shares.max() <= most):  # false where one is NaN
+        actual = f"values from {shares.min():g} to {shares.max():g}"
+    else:
+        return shares
+    expected = "share from 0 to 1" if most == 1.0 else f"number from 0 to {most:g}"
+    raise RunError(f"effects.{effect.NAME}: expected one {expected} for each of {count} {unit}, got {actual}")
+
+
 class Expand(Effect[P], BeamExpander):
     """Turns a beam into weighted sub-beams."""
 
@@ -204,7 +226,7 @@ class Detect(Effect[P]):
         """Return the error for a sensor that lacks a value which the effect needs."""
         try:
             for sensor in filter(self.acts_on, scene.used_sensors.values()):
-                self.detect(np.ones(1), sensor)
+                checked_shares(self, self.detect(np.ones(1), sensor), 1, "ranges")
         except InputError as error:
             return error
         return None
@@ -223,7 +245,8 @@ class Detect(Effect[P]):
         for site in scene.sites:
             range_m = np.sqrt(((points - site.pose.position_m) ** 2).sum(axis=1))
             sensor = scene.sensor(site.sensor)
-            shares.append(self.detect(range_m, sensor).mean() if self.acts_on(sensor) else 1.0)
+            detected = self.detect(range_m, sensor) if self.acts_on(sensor) else np.ones(len(range_m))
+            shares.append(checked_shares(self, detected, len(range_m), "ranges").mean())
         return float(min(shares)), float(max(shares))
 
     def summary(self, scene: Scene) -> str:

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from egvs.core.errors import RunError
 from egvs.core.grid import FloatArray
-from egvs.effects.base import Detect, Effect
+from egvs.effects.base import Detect, checked_shares
 from egvs.sensors.return_model import class_of
 
 if TYPE_CHECKING:
@@ -79,18 +78,3 @@ class ReturnProbability:
 def reflectivity_of(vclasses: Iterable[str]) -> FloatArray:
     """Return the reflectivity of road users by their SUMO vClasses, (n,) float64."""
     return np.array([class_of(vclass).reflectivity for vclass in vclasses], dtype=np.float64)
-
-
-def checked_shares(effect: Effect[Any], shares: object, count: int, unit: str) -> FloatArray:
-    """Return the ``count`` shares of an effect; raise a RunError for anything else, which would give a wrong score."""
-    if not isinstance(shares, np.ndarray):
-        actual = f"{type(shares).__name__}"
-    elif shares.dtype.kind not in "fiub":
-        actual = f"{type(shares).__name__} of {shares.dtype}"
-    elif shares.shape != (count,):
-        actual = f"an array of shape {shares.shape} for {count} {unit}"
-    elif shares.size and not (shares.min() >= 0 and shares.max() <= 1):  # false where one is NaN
-        actual = f"values from {shares.min():g} to {shares.max():g}"
-    else:
-        return shares
-    raise RunError(f"effects.{effect.NAME}: expected one share from 0 to 1 for each of {count} {unit}, got {actual}")

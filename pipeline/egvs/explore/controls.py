@@ -108,6 +108,8 @@ def describe_plan(plan: MovingPlan) -> str:
     if plan.best_next is not None:
         name, gain = plan.best_next
         text += f"; best next: {escape_markdown(name)} (+{format_score(score, gain)})"
+    elif plan.forbids_more:
+        text += f"; {escape_markdown(plan.forbids_more)} allows no further sensor"
     return text
 
 

@@ -436,6 +436,8 @@ class Page:
                 plan = plan.with_moved(site, self.session.beams(site))
         if plan.best_next is None:
             self._notice = "All candidates are in the plan."
+            if plan.forbids_more:
+                self._notice = f"{plan.forbids_more} allows no further sensor."
         else:
             plan = plan.with_added(plan.best_next[0])
         self.plan = plan

@@ -235,6 +235,7 @@ def _plan_values(plan: MovingPlan) -> dict[str, Any]:
         "score": controls.plain_name(score),
         "joint": controls.format_score(score, plan.joint),
         "next": None,
+        "forbids_more": plan.forbids_more,
     }
     if plan.best_next is not None:
         name, gain = plan.best_next

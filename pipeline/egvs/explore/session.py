@@ -37,6 +37,7 @@ from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.effects.returns import ReturnProbability
 from egvs.placement import problem_builder
+from egvs.placement.problem import PlanRules
 from egvs.placement.refinement import PlanPoses
 from egvs.results.labels import SCORE_LABELS
 from egvs.results.plans import SensorPlan
@@ -108,7 +109,10 @@ class MovingPlan:
         names
             Names of the candidates.
         """
-        anywhere = type(work.scenario.placement)()  # sensors may be moved, whatever [placement] requires
+        config = work.scenario.placement
+        anywhere = type(config)(  # sensors may be moved, whatever else [placement] requires
+            excluded=config.excluded, most_per_pole=config.most_per_pole, least_distance_m=config.least_distance_m
+        )
         unconstrained = work.with_scenario(work.scenario.model_copy(update={"placement": anywhere}))
         problem = problem_builder.build_problem(unconstrained, lambda _: None)
         indices = [problem.names.index(name) for name in names]
@@ -142,14 +146,25 @@ class MovingPlan:
         )
         return MovingPlan(extended)
 
+    @property
+    def _rules(self) -> PlanRules:
+        return self.poses.placement_problem.problem.rules
+
+    @property
+    def forbids_more(self) -> str:
+        """The rules that forbid any further sensor, as :meth:`egvs.placement.problem.PlanRules.what_forbids_more`."""
+        return self._rules.what_forbids_more(self.poses.plan)
+
     def gain(self, candidate: str) -> float:
         """Return the increase of the joint score if a candidate is added."""
         return self.with_added(candidate).joint - self.joint
 
     @cached_property
     def best_next(self) -> tuple[str, float] | None:
-        """The candidate with the largest gain, and its gain; None if the plan contains all."""
-        gains = {name: self.gain(name) for name in self.poses.placement_problem.names if name not in self.sites}
+        """The candidate with the largest gain that the rules allow, and its gain; None if there is none."""
+        problem = self.poses.placement_problem
+        allowed = self._rules.allowed_additions(self.poses.plan)
+        gains = {name: self.gain(name) for name, is_allowed in zip(problem.names, allowed, strict=True) if is_allowed}
         return max(gains.items(), key=lambda item: item[1], default=None)
 
 

@@ -47,6 +47,7 @@ from egvs.results.plans import (
 from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
 from egvs.runs.run_context import open_folder
+from egvs.scenario.loading import check_is_scenario
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import RefinementConfig
 from egvs.scoring import zones as zone_files
@@ -227,6 +228,7 @@ def place(
     InputError
         When no plan meets ``[placement]``; the message names the nearest request that can be met.
     """
+    check_is_scenario(scenario)
     if refine:
         plugins.require_libraries("egvs place --refine", "place", "cma")
     folder = Path(out) if out is not None else run.default_folder(scenario)
@@ -457,6 +459,7 @@ def _make_placement(
         zones=tuple(zones),
         is_best=solution.is_best,
         fewest_is_proved=solution.fewest_is_proved,
+        forbids_more=given.rules.what_forbids_more(solution.order),
     )
 
 

@@ -18,10 +18,11 @@ expected_visibility    voxels with traffic    1 where a beam crosses            
 points_on_target       vehicle-frames         points                                      ln(1 + t)
 seen_well              vehicle-frames         points                                      1 - exp(-t / n0)
 expected_detections    vehicle-frames         -ln(1 - detection probability)              1 - exp(-t)
+those of plug-ins      vehicle-frames         -ln(1 - value)                              1 - exp(-t)
 =====================  =====================  ==========================================  ==================
 
-``expected_detections`` treats sensors as independent: a vehicle is missed when each sensor by itself misses it. It does
-not model detectors that work on merged point clouds.
+The last two treat sensors as independent: a vehicle is missed when each sensor by itself misses it. They do not model
+detectors that work on merged point clouds.
 
 Amounts and their totals are whole numbers, so the value of a plan depends neither on the order of its sensors nor on
 the number of threads. They are stored as sparse rows, in memory or, above :data:`MAX_BYTES_IN_MEMORY`, in a temporary
@@ -312,6 +313,22 @@ class PlanRules:
             total_cost = self.cost_of(candidates) + self.further_cost(candidates)
             allowed &= total_cost <= self.budget * (1.0 + _COST_TOLERANCE)
         return allowed
+
+    def what_forbids_more(self, plan: Sequence[int]) -> str:
+        """Return the rules that forbid every other candidate beside a plan, whatever the count and the budget are.
+
+        Empty if one may be added, or there is no other.
+        """
+        unlimited = replace(self, count=len(self.cost) + 1, budget=np.inf)
+        without_rules = replace(unlimited, most_per_pole=len(self.cost), least_distance_m=0.0)
+        if unlimited.allowed_additions(plan).any() or not without_rules.allowed_additions(plan).any():
+            return ""
+        rules = {
+            f"most_per_pole = {self.most_per_pole}": replace(without_rules, most_per_pole=self.most_per_pole),
+            f"least_distance_m = {self.least_distance_m:g}": replace(unlimited, most_per_pole=len(self.cost)),
+        }
+        free = without_rules.allowed_additions(plan)
+        return " and ".join(name for name, alone in rules.items() if (free & ~alone.allowed_additions(plan)).any())
 
     def allows(self, plan: Sequence[int]) -> bool:
         """Whether a plan, in any order, keeps the rules and contains the forced candidates."""

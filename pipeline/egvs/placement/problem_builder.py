@@ -23,14 +23,14 @@ from egvs.effects.base import Detect
 from egvs.placement import problem
 from egvs.placement.problem import CoverageTerm, Demand, PlanRules, Problem, VisibilityMatrix, VisibilityRow
 from egvs.scenario.model import Scenario
-from egvs.scenario.score_config import COST_COLUMN, ZoneDemand
+from egvs.scenario.score_config import COST_COLUMN, DEFAULT_SCORE, ZoneDemand, is_plugin_score
 from egvs.scoring.scorer import ever_occupied
 from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.scoring.targets import VisibleTargets
 from egvs.scoring.visibility import Beams, HitCounter
 from egvs.scoring.zones import placement_zones, region_bounds_m
 from egvs.sensors.sensor import check_sensor_names
-from egvs.sensors.sites import Site, candidate_sites
+from egvs.sensors.sites import Site, candidate_sites, pole_exists
 from egvs.stages.base import StageContext
 from egvs.stages.site_scans import SiteScan, empty_scans
 from egvs.stages.site_scoring import TargetScorer
@@ -106,7 +106,8 @@ class TargetView:
         self._score = score
         self._detectors = targets.detectors if detectors is None else tuple(detectors)
         scene = context.scene
-        if score == "expected_detections":
+        self._has_chances = score == DEFAULT_SCORE or is_plugin_score(score)
+        if self._has_chances:
             self.unit = problem.CHANCE_UNIT
         elif scene.weights_beams or scene.acting(Detect, "score"):
             self.unit = _POINT_UNIT
@@ -120,7 +121,7 @@ class TargetView:
 
     def without_each_detector(self) -> list[TargetView]:
         """Return one view for each detector of the score, by all the others; empty for a score of one, or of none."""
-        if self._score != "expected_detections" or len(self._detectors) < 2:
+        if self._score != DEFAULT_SCORE or len(self._detectors) < 2:
             return []
         others = [[other for other in self._detectors if other != left_out] for left_out in self._detectors]
         return [TargetView(self.context, self.targets, self._score, names) for names in others]
@@ -131,7 +132,7 @@ class TargetView:
         return VisibilityRow.of(np.rint(amounts * self.unit).astype(np.int64), _MAX_WEIGHTED_HITS)
 
     def _amounts(self, visible: VisibleTargets) -> FloatArray:
-        if self._score != "expected_detections":
+        if not self._has_chances:
             return visible.points
         probability = np.minimum(TARGET_SCORES[self._score](visible, self._detectors), _MAX_PROBABILITY)
         return -np.log1p(-probability)
@@ -575,8 +576,9 @@ def candidate_costs(scenario: Scenario, sites: Sequence[Site]) -> tuple[FloatArr
         if costs.sensor and site.sensor not in costs.sensor:
             problem_text = f"the cost of sensor {site.sensor} (site {site.name}) is unknown"
             raise InputError(f"{scenario.file}: costs.sensor", problem_text, f'Add "{site.sensor}" = COST.')
-        cost[i] = costs.of_mount(site.sensor, site.pose.z_m)
-        pole_cost[i] = costs.pole
+        exists = pole_exists(site.pole, scenario.sites.existing_poles)
+        cost[i] = costs.of_mount(site.sensor, site.pose.z_m, pole_exists=exists)
+        pole_cost[i] = 0.0 if exists else costs.pole
         _check_cost(f"{scenario.file}: costs ({site.name})", float(cost[i]))
     return cost, pole_cost
 

@@ -517,7 +517,9 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
 
 def _sensor_values(contents: PageContents) -> dict[str, Any]:
     """The best mount of each sensor; None where there is one sensor."""
-    sensors = SensorComparison.of_run(contents.ranking.sites, contents.scenario.costs)
+    sensors = SensorComparison.of_run(
+        contents.ranking.sites, contents.scenario.costs, contents.scenario.sites.existing_poles
+    )
     names = [site.sensor for site in contents.ranking.sites]
     return {
         "sensors": sensors,

@@ -16,6 +16,7 @@ from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.wording import format_percent
 from egvs.results.labels import ScoreLabel, join_names
 from egvs.results.plans import PlannedSensor, PlanStep, SensorPlan
+from egvs.scenario.score_config import is_plugin_score
 
 MIN_USEFUL_SHARE = 0.01
 """A useful sensor adds at least 1 percentage point; to scores that are no shares, at least 1 % of the plan's score."""
@@ -36,6 +37,7 @@ def describe_plan_count(plan: SensorPlan) -> str:
         has_budget=plan.request["budget"] is not None,
         objective=describe_objective(plan.request),
         next_count=next_count(plan),
+        forbids_more=plan.forbids_more,
     )
 
 
@@ -59,7 +61,7 @@ def describe_joint_score(by: ScoreLabel, sensors: int) -> str:
     sensors
         Number of sensors of the plan.
     """
-    if sensors < 2 or by.name not in _INDEPENDENT_SCORES:
+    if sensors < 2 or not (by.name in _INDEPENDENT_SCORES or is_plugin_score(by.name)):
         return ""
     return (
         "Joint shares assume that sensors miss vehicles independently; near 100 % they are upper ends "
@@ -102,8 +104,9 @@ def describe_count(
     has_budget: bool = False,
     objective: str = "",
     next_count: int | None = None,
+    forbids_more: str = "",
 ) -> str:
-    """Return how many sensors are enough, in one or two sentences; empty if there is nothing to compare or to try.
+    """Return how many sensors are enough, in one to three sentences; empty if there is nothing to compare or to try.
 
     Parameters
     ----------
@@ -121,9 +124,18 @@ def describe_count(
         What the plans maximise, if not the joint score; then gains of the joint score do not tell what is enough.
     next_count
         The number of sensors to try next; None if there is no larger plan to try.
+    forbids_more
+        The rules that forbid any further sensor. Then plans of more sensors are the same as the last possible one.
     """
     try_next = ""
-    if next_count is not None:
+    if forbids_more:
+        n_sensors = len(steps[-1].sites)
+        steps = [step for step in steps if step.count <= n_sensors] or steps[:1]
+        verb = "forbid" if " and " in forbids_more else "forbids"
+        try_next = (
+            f"{forbids_more} {verb} {_ordinal(n_sensors + 1)} sensor beside {'it' if n_sensors == 1 else 'them'}."
+        )
+    elif next_count is not None:
         try_next = f"Try --count {next_count} to see what {_ordinal(next_count)} adds."
     if len(steps) < 2:
         return try_next
@@ -131,7 +143,8 @@ def describe_count(
     before, last = steps[-2], steps[-1]
     if objective:
         adds = _describe_gain(last, by)
-        return f"{_capitalise(_ordinal(last.count))} sensor adds {adds} to {by.noun}; the plan maximises {objective}."
+        answer = f"{_capitalise(_ordinal(last.count))} sensor adds {adds} to {by.noun}; the plan maximises {objective}."
+        return f"{answer} {try_next if forbids_more else ''}".rstrip()
 
     enough = _last_useful_step(steps, by)
     if enough < len(steps) - 1:
@@ -187,7 +200,7 @@ def next_count(plan: SensorPlan) -> int | None:
     """Return the number of sensors to try next; None if the plan is not limited by its count alone."""
     sensors = len(plan.sensors)
     is_limited_otherwise = plan.request["budget"] is not None or plan.request["reach"] is not None
-    if is_limited_otherwise or sensors < plan.curve[-1].count or sensors >= plan.candidates:
+    if is_limited_otherwise or plan.forbids_more or sensors < plan.curve[-1].count or sensors >= plan.candidates:
         return None
     return sensors + 1
 

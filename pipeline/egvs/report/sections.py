@@ -16,7 +16,7 @@ from egvs.core.errors import Diagnostic
 from egvs.core.wording import list_first
 from egvs.results.labels import join_names
 from egvs.results.ranking import Pole
-from egvs.scenario.model import Scenario
+from egvs.scenario.model import NO_SURROUNDINGS, POLE_POSITIONS, Scenario
 from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.signal_descriptions import ASSUMED_SOURCE, plan_title
@@ -43,7 +43,8 @@ def assumptions(scenario: Scenario, plans: Sequence[Mapping[str, Any]]) -> tuple
     Parameters
     ----------
     scenario
-        The scenario. Where it has plans of signals, those that are still assumed are named, if there are any.
+        The scenario. Where it has plans of signals, those that are still assumed are named, if there are any. Poles
+        that exist are not assumed; that nothing stands beside the road is.
     plans
         Plans of the signals in the region, from the summary of the traffic
         (:func:`egvs.traffic.signal_descriptions.describe_signals`).
@@ -54,6 +55,15 @@ def assumptions(scenario: Scenario, plans: Sequence[Mapping[str, Any]]) -> tuple
         remaining = [plan_title(plan) for plan in plans if plan["source"] == ASSUMED_SOURCE]
         named = (f"{ASSUMED_PLANS} of {join_names(remaining)}",) if remaining else ()
         assumed = tuple(chain.from_iterable(named if entry == ASSUMED_PLANS else (entry,) for entry in assumed))
+    if scenario.sites.existing_poles == "all":
+        assumed = tuple(entry for entry in assumed if entry != POLE_POSITIONS)
+    elif scenario.sites.existing_poles:
+        others = f"{POLE_POSITIONS} other than {join_names(scenario.sites.existing_poles)}"
+        assumed = tuple(others if entry == POLE_POSITIONS else entry for entry in assumed)
+    statics = scenario.statics
+    has_surroundings = statics.footprints or statics.polygons or statics.meshes or scenario.sites.points
+    if not has_surroundings and NO_SURROUNDINGS not in assumed:
+        assumed = (*assumed, NO_SURROUNDINGS)
     has_demand = traffic.network is None or bool(traffic.counts or traffic.routes)
     if has_demand or any(period.counts or period.routes for period in traffic.periods):
         return assumed

@@ -196,7 +196,18 @@ _LABELS = (
     ),
 )  # fmt: skip
 
-SCORE_LABELS = {label.name: label for label in _LABELS}
+
+class _ScoreLabels(dict[str, ScoreLabel]):
+    """Labels by name; a score of another package has a label with its name."""
+
+    def __missing__(self, name: str) -> ScoreLabel:
+        means = f"Sites are ranked by {name}, a score of an installed package with a value for each vehicle."
+        label = ScoreLabel(name, f"the score {name}", name, "scores {}", f"{means} {_VEHICLES_NOTE}")
+        self[name] = label
+        return label
+
+
+SCORE_LABELS = _ScoreLabels((label.name, label) for label in _LABELS)
 """Labels by the name of the score."""
 
 

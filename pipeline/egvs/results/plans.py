@@ -277,6 +277,8 @@ class SensorPlan:
         Whether it is proved that no plan is better.
     fewest_is_proved
         Whether it is proved that one sensor fewer cannot meet the requirements; None if this was not requested.
+    forbids_more
+        The rules that forbid any further sensor, e.g. ``"most_per_pole = 1"``; empty if one may be added.
     errors_from
         How the standard errors were computed; or the reason why there are none.
     stages
@@ -303,6 +305,7 @@ class SensorPlan:
     zones: tuple[ZoneCoverage, ...]
     is_best: bool
     fewest_is_proved: bool | None
+    forbids_more: str = ""
     errors_from: str = ""
     stages: Mapping[str, str] = field(default_factory=dict)
     refinement: RefinementSummary | None = None
@@ -341,6 +344,7 @@ class SensorPlan:
             zones=tuple(ZoneCoverage(**zone) for zone in plan["zones"]),
             is_best=plan["is_best"],
             fewest_is_proved=plan["fewest_is_proved"],
+            forbids_more=plan.get("forbids_more", ""),
             errors_from=plan.get("standard_errors", "the plan was made by an older version of egvs place"),
             stages=metadata["stages"],
             refinement=refinement,
@@ -364,6 +368,8 @@ class SensorPlan:
             "zones": [asdict(zone) for zone in self.zones],
             "standard_errors": self.errors_from,
         }
+        if self.forbids_more:
+            plan["forbids_more"] = self.forbids_more
         if self.refinement is not None:  # without its duration: equal plans are equal files
             plan["moves"] = {
                 "before": self.refinement.joint_before,

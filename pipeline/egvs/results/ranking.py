@@ -96,9 +96,10 @@ class RankedSite:
             Name of the score that ranks; the metadata of the table has it.
         """
         names = [column.name for column in fields(cls) if column.name in scores.column_names]
-        known = {*parquet.column_names("scores"), *names}
+        known = {*parquet.column_names("scores"), *names, rank_by, f"{rank_by}_se"}
         user_names = [name for name in scores.column_names if name not in known]
-        other_names = [name for name in SCORE_LABELS if name != "egvs" and name in scores.column_names]
+        other_names = [name for name in dict.fromkeys([*SCORE_LABELS, rank_by]) if name in scores.column_names]
+        other_names.remove("egvs")
 
         sites = []
         for row in scores.to_pylist():

@@ -16,6 +16,7 @@ from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.results.labels import format_count
 from egvs.results.ranking import RankedSite
 from egvs.scenario.score_config import COST_COLUMN, CostsConfig
+from egvs.sensors.sites import pole_exists
 
 _PROBABILITY_DIGITS = 6
 """The last bits of a distribution function depend on the machine."""
@@ -100,7 +101,9 @@ class SensorMount:
         return self.site.sensor
 
 
-def best_mounts(sites: Iterable[RankedSite], costs: CostsConfig, run: str = "") -> tuple[SensorMount, ...]:
+def best_mounts(
+    sites: Iterable[RankedSite], costs: CostsConfig, run: str = "", existing_poles: Sequence[str] = ()
+) -> tuple[SensorMount, ...]:
     """Return the best mount of each sensor.
 
     Parameters
@@ -111,14 +114,16 @@ def best_mounts(sites: Iterable[RankedSite], costs: CostsConfig, run: str = "") 
         Costs of the scenario.
     run
         Label of the run.
+    existing_poles
+        Those of ``[sites]``.
     """
     best: dict[str, RankedSite] = {}
     for site in sites:
         best.setdefault(site.sensor, site)
-    return tuple(SensorMount(run, site, site_cost(site, costs)) for site in best.values())
+    return tuple(SensorMount(run, site, site_cost(site, costs, existing_poles)) for site in best.values())
 
 
-def site_cost(site: RankedSite, costs: CostsConfig) -> float | None:
+def site_cost(site: RankedSite, costs: CostsConfig, existing_poles: Sequence[str] = ()) -> float | None:
     """Return the cost of a site, from its column ``cost`` or ``[costs]``; None if that of its sensor is unknown."""
     text = dict(site.user_columns).get(COST_COLUMN)
     if text:
@@ -129,7 +134,7 @@ def site_cost(site: RankedSite, costs: CostsConfig) -> float | None:
         return cost if 0.0 <= cost < math.inf else None
     if site.sensor not in costs.sensor:
         return None
-    return costs.of_mount(site.sensor, site.z_m)
+    return costs.of_mount(site.sensor, site.z_m, pole_exists=pole_exists(site.pole, existing_poles))
 
 
 @dataclass(frozen=True)
@@ -209,10 +214,13 @@ class SensorComparison:
         return cls(tuple(results), has_costs)
 
     @classmethod
-    def of_run(cls, sites: Sequence[RankedSite], costs: CostsConfig) -> SensorComparison | None:
+    def of_run(
+        cls, sites: Sequence[RankedSite], costs: CostsConfig, existing_poles: Sequence[str] = ()
+    ) -> SensorComparison | None:
         """Compare the sensors of one run, whose sites are by rank; errors of differences as if independent."""
         return cls.of(
-            best_mounts(sites, costs), lambda mount, other: ScoreDifference.of_independent(mount.site, other.site)
+            best_mounts(sites, costs, existing_poles=existing_poles),
+            lambda mount, other: ScoreDifference.of_independent(mount.site, other.site),
         )
 
     @property

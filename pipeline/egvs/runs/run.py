@@ -39,7 +39,7 @@ from egvs.runs.run_context import open_folder
 from egvs.runs.stage_keys import StageKey
 from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
-from egvs.scenario.loading import scenario_from_dict
+from egvs.scenario.loading import check_is_scenario, scenario_from_dict
 from egvs.scenario.model import Scenario
 from egvs.stages import inputs as stage_inputs
 from egvs.stages.base import StageContext
@@ -110,6 +110,7 @@ def run(
     >>> egvs.read_scores("runs/example/scores.parquet").num_rows == len(egvs.build_scene(scenario).sites)
     True
     """
+    check_is_scenario(scenario)
     open_context = partial(open_folder, scenario, jobs=jobs, progress=progress)
     with _start_run(scenario, out, listener, open_context, wait_s) as current:
         return current.run_stages(only, options or {})
@@ -244,6 +245,7 @@ def refresh_report(out: Path) -> Path | None:
 
 def default_folder(scenario: Scenario) -> Path:
     """Return the run folder where none is given: ``runs/<name>``, or ``runs/<name>@<label>`` with overrides."""
+    check_is_scenario(scenario)
     return run_names.run_folder(scenario.name, scenario.overrides)
 
 

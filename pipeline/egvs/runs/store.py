@@ -303,8 +303,9 @@ def check_outside_store(folder: Path) -> None:
 _HASH_FIELD = "sha256"
 """Key in the record of an entry with the hash of all other keys."""
 
-ENTRY_KINDS = (*STAGE_NAMES, "points", "detections", "part", "scene")
-"""Kinds of entries: stages, detections and points of a site, parts of a score, and checks of a scene."""
+ENTRY_KINDS = (*STAGE_NAMES, "points", "detections", "part", "scene", "trial")
+"""Kinds of entries: stages, detections and points of a site, parts of a score, checks of a scene, and simulations that
+find the traffic of a new city."""
 
 _ENTRY_NAME = re.compile(rf"({'|'.join(ENTRY_KINDS)})-[0-9a-f]{{32}}")
 """Name of the folder of an entry; folders with other names do not belong to the store and are never changed."""

@@ -27,6 +27,7 @@ from egvs.core.numbers import number_or_nan
 from egvs.scenario.fields import NAME_DESCRIPTION
 from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario, StaticsConfig
 from egvs.scenario.settings import changed_settings, flatten_settings
+from egvs.scenario.shipped import shipped_names, shipped_scenario
 from egvs.scenario.traffic_config import (
     COUNT_IDS,
     COUNT_NAMES,
@@ -169,7 +170,8 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     Parameters
     ----------
     path
-        The folder, or its ``scenario.toml``.
+        The folder, or its ``scenario.toml``; the name of a scenario that comes with this program, if there is no such
+        folder.
     overrides
         ``"table.key=value"``, the value as in TOML; a word without quotes is a string.
 
@@ -188,6 +190,8 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     path = Path(path)
     files.check_utf8("the scenario", str(path.absolute()))
     overrides = tuple(overrides)
+    if path.name == os.fspath(path) and path.name in shipped_names() and not path.exists():
+        path = shipped_scenario(path.name)
     file = path / SCENARIO_FILE if path.is_dir() else path
     values = apply_overrides(_read_with_bases(file, ()), overrides)
     try:
@@ -341,7 +345,7 @@ def _read_counts(path: Path, where: str) -> list[dict[str, Any]]:
     return counts
 
 
-_SITE_SOURCE_KEYS = ("points", "only_free", "heights_m")
+_SITE_SOURCE_KEYS = ("points", "only_free", "heights_m", "existing_poles")
 """Keys of ``[sites]`` that go with one source of sites; a new source does not take them over."""
 _POLYGON_KEYS = ("polygon_height_m", "polygon_types")
 """Keys of ``[statics]`` that go with ``polygons``."""
@@ -471,13 +475,21 @@ def _recorded_folder(run: Path) -> str:
 
 
 def _suggest_similar_scenario(folder: Path) -> str:
-    """Return a hint at a scenario beside a folder that does not exist, with a similar name."""
-    hint = f"Give a folder with a {SCENARIO_FILE}, or the file."
-    if not folder.parent.is_dir():
-        return hint
-    scenarios = {path.name: path for path in sorted(folder.parent.iterdir()) if (path / SCENARIO_FILE).is_file()}
+    """Return a hint at a scenario with a similar name, beside a missing folder or shipped, or at all shipped ones."""
+    scenarios = {name: Path(name) for name in shipped_names()}
+    hint = f"Give a folder with a {SCENARIO_FILE}, or the name of a shipped scenario: {', '.join(scenarios)}."
+    if folder.parent.is_dir():
+        paths = (path for path in folder.parent.iterdir() if (path / SCENARIO_FILE).is_file())
+        scenarios |= {path.name: path for path in sorted(paths)}
     similar = difflib.get_close_matches(folder.name, scenarios, 1)
     return f"Did you mean {scenarios[similar[0]]}?" if similar else hint
+
+
+def check_is_scenario(scenario: object) -> None:
+    """Raise an InputError for a path or another value in place of a scenario."""
+    if not isinstance(scenario, Scenario):
+        problem = f"expected the result of egvs.load, got {str(scenario)[:80]!r}"
+        raise InputError("scenario", problem, "Use egvs.load(FOLDER).")
 
 
 def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:

@@ -123,6 +123,12 @@ class MeshConfig(StrictModel):
         return None
 
 
+POLE_POSITIONS = "positions of the poles"
+"""Entry of the key ``assumed``: no candidate pole is known to exist."""
+
+NO_SURROUNDINGS = "surroundings (no building or tree is known)"
+"""Entry of the key ``assumed``: no map has anything that could hide vehicles."""
+
 TERRAIN_KEY = "statics.terrain"
 """The key of the file with the ground beyond the roads."""
 
@@ -257,12 +263,18 @@ class SitesConfig(StrictModel):
     mount: SensorMount | None = Field(
         None, description="'inverted': upside down, with the front in the same direction. By default that of the sensor"
     )
+    existing_poles: tuple[str, ...] | Literal["all"] = Field(
+        (), description="Names of poles that exist, or 'all': they cost nothing, and their positions are not assumed"
+    )
 
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out newer keys where they are not set, so that they do not change cache keys."""
-        newer = ("replace_sensor", "mount")
-        return {name: value for name, value in serialize(self).items() if name not in newer or value is not None}
+        values: dict[str, Any] = serialize(self)
+        for name in ("replace_sensor", "mount", "existing_poles"):
+            if not values.get(name):
+                values.pop(name, None)
+        return values
 
     @model_validator(mode="after")
     def _check_source(self) -> SitesConfig:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
     AfterValidator,
@@ -14,7 +14,7 @@ from pydantic import (
     model_validator,
 )
 
-from egvs.core import limits
+from egvs.core import limits, plugins
 from egvs.scenario.fields import Name, NotNegative, Point2, Positive, StrictModel, find_duplicates
 
 VehicleClass = Literal[
@@ -35,6 +35,28 @@ OtherScore = Literal[
 ]  # fmt: skip
 """Scores besides the EGVS. ``noticed`` ranks no sites: it does not ask how well a box fits."""
 
+SCORES_GROUP = "egvs.scores"
+"""Entry points of scores; of those of other packages, a :class:`egvs.scoring.target_scores.VehicleScore` can rank."""
+
+
+def plugin_scores() -> list[str]:
+    """Return the names of the scores that other packages provide, sorted."""
+    names = plugins.plugin_names(SCORES_GROUP)
+    return [name for name in names if plugins.plugin_package(SCORES_GROUP, name) != plugins.PACKAGE_NAME]
+
+
+def is_plugin_score(name: str) -> bool:
+    """Return whether a score is one that another package provides."""
+    return name not in get_args(OtherScore) and name in plugin_scores()
+
+
+def _check_ranking_score(name: str) -> str:
+    """Return the name of a score that can rank sites; ValueError for any other, and for one that is not installed."""
+    if name not in (known := [*get_args(RankingScore), *plugin_scores()]):
+        raise ValueError(f"expected one of {', '.join(known)}, got {name[:80]!r}")
+    return name
+
+
 DEFAULT_SCORE: OtherScore = "expected_detections"
 """The score that the validation study recommends (docs/validity.md), and that new scenarios rank by."""
 
@@ -43,6 +65,12 @@ NOTICED: OtherScore = "noticed"
 
 VEHICLE_SCORES: tuple[OtherScore, ...] = ("expected_detections", "noticed", "seen_well", "points_on_target")
 """Scores that are means over the vehicles of recorded frames."""
+
+
+def is_vehicle_score(name: str) -> bool:
+    """Return whether a score is a mean over the vehicles of recorded frames, as all plug-in scores that rank are."""
+    return name in VEHICLE_SCORES or is_plugin_score(name)
+
 
 Detector = Literal[
     "cluster", "pointpillars", "pointpillars_sensor", "cluster_uncorrected", "pointpillars_uncorrected"
@@ -171,7 +199,11 @@ class ScoreConfig(StrictModel):
         description="Cap of the beams that count in one voxel: 0, at least 1e-9, or inf. 'auto' depends on the "
         "size of voxels: 10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), and half of that with moving_occlusion",
     )
-    rank_by: RankingScore = Field("egvs", description="Score that sites are ranked by")
+    rank_by: Annotated[str, AfterValidator(_check_ranking_score)] = Field(
+        "egvs",
+        description=f"Score that sites are ranked by: {', '.join(get_args(RankingScore))}, or a VehicleScore of an "
+        "installed package (docs/extending.md)",
+    )
     others: tuple[OtherScore, ...] = Field(
         (DEFAULT_SCORE,), description="Further scores in scores.parquet, besides egvs and the score of rank_by"
     )
@@ -265,15 +297,15 @@ class ScoreConfig(StrictModel):
     @property
     def needs_vehicles(self) -> bool:
         """Whether a score, the blind spots or the zones need the vehicles of recorded frames."""
-        return self.blindspots or self.zones is not None or any(name in VEHICLE_SCORES for name in self.additional)
+        return self.blindspots or self.zones is not None or any(is_vehicle_score(name) for name in self.additional)
 
     @property
-    def additional(self) -> tuple[OtherScore, ...]:
+    def additional(self) -> tuple[str, ...]:
         """The scores to compute besides the EGVS, without duplicates; the one that sites are ranked by is the first.
 
         :data:`NOTICED` is computed whenever :data:`DEFAULT_SCORE` is.
         """
-        names = self.others
+        names: tuple[str, ...] = self.others
         if self.rank_by != "egvs":
             names = (self.rank_by, *(name for name in self.others if name != self.rank_by))
         if DEFAULT_SCORE in names and NOTICED not in names:
@@ -302,9 +334,10 @@ class CostsConfig(StrictModel):
         """Whether any cost is set."""
         return bool(self.sensor or self.pole or self.metre)
 
-    def of_mount(self, sensor: str, z_m: float) -> float:
+    def of_mount(self, sensor: str, z_m: float, *, pole_exists: bool) -> float:
         """Return the cost of a sensor at a height, with its pole; a sensor without a cost of its own counts 0."""
-        return self.sensor.get(sensor, 0.0) + self.pole + self.metre * z_m
+        pole = 0.0 if pole_exists else self.pole
+        return self.sensor.get(sensor, 0.0) + pole + self.metre * z_m
 
 
 class ZoneDemand(ZoneArea):

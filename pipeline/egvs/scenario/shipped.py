@@ -32,11 +32,14 @@ def shipped_scenario(name: str) -> Path:
     >>> egvs.load(egvs.shipped_scenario("roundabout")).name
     'roundabout'
     """
-    folder = data_folder("scenarios")
-    names = sorted(path.parent.name for path in folder.glob(f"*/{SCENARIO_FILE}"))
-    if name not in names:
-        raise InputError("scenario", f"expected one of {', '.join(names)}, got {name!r}")
-    return folder / name
+    if name not in shipped_names():
+        raise InputError("scenario", f"expected one of {', '.join(shipped_names())}, got {name!r}")
+    return data_folder("scenarios") / name
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the scenarios that come with this program, sorted."""
+    return sorted(path.parent.name for path in data_folder("scenarios").glob(f"*/{SCENARIO_FILE}"))
 
 
 def copy_scenario(name: str, folder: Path) -> None:

@@ -26,6 +26,7 @@ from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray
 from egvs.core.wording import list_first
 from egvs.scenario.model import SCENARIO_FILE
+from egvs.scenario.score_config import is_plugin_score
 from egvs.scoring.scorer import SiteScore, ranks
 from egvs.scoring.standard_errors import BlockGroups, LagBehindBest, ScoreUncertainty, beats_next, lag_behind_best
 from egvs.scoring.target_scores import SiteTargetScores
@@ -258,9 +259,12 @@ def write_scores_by_period(
         path.unlink(missing_ok=True)
         return
     more = [name for name in additional if name != "entropy_seen"]
+    extra = {name: pa.array([0.0]) for name in filter(is_plugin_score, more)}  # the schema cannot name it
     has_errors = all(period in scores.groups for period in scores.periods)
-    optional = (*("egvs_se", "egvs_bias"), *more) if has_errors else tuple(more)
-    with parquet.artefact_writer(path, "scores_by_period", optional) as file:
+    optional = tuple(name for name in more if name not in extra)
+    if has_errors:
+        optional = ("egvs_se", "egvs_bias", *optional)
+    with parquet.artefact_writer(path, "scores_by_period", optional, extra=extra) as file:
         for period in scores.periods:
             egvs = scores.column("egvs", period)
             columns: dict[str, Any] = {

@@ -57,10 +57,19 @@ from typing import Any, get_args
 
 import numpy as np
 
+from egvs.core import plugins
+from egvs.core.errors import RunError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
 from egvs.kernels.boosted_trees import add_tree_values
-from egvs.scenario.score_config import MEAN_DETECTORS, UNCORRECTED, Detector
+from egvs.scenario.score_config import (
+    MEAN_DETECTORS,
+    SCORES_GROUP,
+    UNCORRECTED,
+    Detector,
+    is_plugin_score,
+    is_vehicle_score,
+)
 from egvs.scoring.blindspots import SpotVisibility
 from egvs.scoring.noticed import CARS, group_members, noticed_chances
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetVisibility, weighted_mean
@@ -395,10 +404,81 @@ def _score_noticed(visible: TargetVisibility, _: Sequence[str]) -> FloatArray:
     return noticed_chances(visible)
 
 
-TARGET_SCORES: Mapping[str, TargetScore] = {
-    "expected_detections": _score_detection,
-    "noticed": _score_noticed,
-    "points_on_target": _score_points,
-    "seen_well": _score_seen_well,
-}
+@dataclass(frozen=True)
+class VehicleScore:
+    """A score of another package, an entry point of the group ``egvs.scores``, by which sites are ranked and planned.
+
+    A site's score is the weighted mean over vehicle-frames. Several sensors count as independent: with values p and q,
+    a vehicle counts 1 - (1 - p) (1 - q).
+
+    Attributes
+    ----------
+    name
+        Name of its entry point.
+    formula
+        What it computes, in words.
+    source
+        Where it is published.
+    function
+        Returns the value of each vehicle-frame from what a site sees of it, (n,) float64, 0 to 1. The same input always
+        gives the same values.
+    """
+
+    name: str
+    formula: str
+    source: str
+    function: Callable[[TargetVisibility], FloatArray]
+
+    def __call__(self, visible: TargetVisibility, _: Sequence[str] = ()) -> FloatArray:
+        """Return the value of each vehicle-frame; a RunError for anything but one number from 0 to 1 for each."""
+        values = np.asarray(self.function(visible))
+        n_vehicles = len(visible.points)
+        if values.shape != (n_vehicles,) or values.dtype.kind not in "fiub":
+            actual = f"{values.dtype} of shape {values.shape}"
+        elif n_vehicles and not (values.min() >= 0.0 and values.max() <= 1.0):
+            actual = f"values from {values.min():g} to {values.max():g}"
+        else:
+            return values.astype(np.float64)
+        raise RunError(f"score {self.name}: expected {n_vehicles} numbers from 0 to 1, got {actual}")
+
+
+def load_vehicle_score(name: str) -> VehicleScore:
+    """Return the score of another package.
+
+    Raises
+    ------
+    InputError
+        When there is no such score.
+    MissingBackendError
+        When it cannot be loaded, or can rank no sites.
+    """
+    score = plugins.load_plugin(SCORES_GROUP, name)
+    if not isinstance(score, VehicleScore):
+        expected = f"{VehicleScore.__module__}.{VehicleScore.__name__}"
+        problem = f"only a {expected} can rank sites, got a {type(score).__name__}"
+        raise plugins.plugin_error(SCORES_GROUP, name, problem)
+    if score.name != name:
+        problem = f"expected the name {name!r} of its entry point, got {score.name!r}"
+        raise plugins.plugin_error(SCORES_GROUP, name, problem)
+    return score
+
+
+class _TargetScores(dict[str, TargetScore]):
+    """Scores by name, with those of other packages, which are loaded when they are used."""
+
+    def __missing__(self, name: str) -> TargetScore:
+        if not is_plugin_score(name):
+            raise KeyError(name)
+        return load_vehicle_score(name)
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and is_vehicle_score(name)
+
+
+TARGET_SCORES = _TargetScores(
+    expected_detections=_score_detection,
+    noticed=_score_noticed,
+    points_on_target=_score_points,
+    seen_well=_score_seen_well,
+)
 """Scores of vehicle-frames by the names that ``[score] rank_by`` and ``additional`` use."""

@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
-from egvs.effects.base import Detect, TransmitScore
-from egvs.effects.returns import ReturnProbability, checked_shares
+from egvs.effects.base import Detect, TransmitScore, checked_shares
+from egvs.effects.returns import ReturnProbability
 from egvs.kernels import hits as hit_kernels
 from egvs.kernels import traversal
 from egvs.scoring.egvs import Hits as Hits

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from egvs.core.errors import RunError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,6 +34,22 @@ class SubBeams(NamedTuple):
     directions: FloatArray
     parent: IntArray
     weight: FloatArray
+
+
+def checked_sub_beams(effect: Any, sub_beams: object, n_beams: int) -> SubBeams:
+    """Return the sub-beams of an effect; raise a RunError for arrays that do not fit together or its ``n_beams``."""
+    try:
+        directions, parent, weight = (np.asarray(array) for array in sub_beams)  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        actual = f"{type(sub_beams).__name__}"
+    else:
+        actual = f"shapes {directions.shape}, {parent.shape} and {weight.shape}"
+        if directions.shape == (*parent.shape, 3) and parent.shape == weight.shape == (len(weight),):
+            actual = "parents of other beams"
+            if parent.dtype.kind in "iu" and (not parent.size or 0 <= parent.min() <= parent.max() < n_beams):
+                return SubBeams(directions, parent, weight)
+    expected = f"directions (m, 3), parents (m,) and weights (m,) of sub-beams of {n_beams} beams"
+    raise RunError(f"effects.{effect.NAME}: expected {expected}, got {actual}")
 
 
 @runtime_checkable

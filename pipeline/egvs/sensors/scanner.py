@@ -29,7 +29,7 @@ from egvs.formats.georeference import height_unit_m
 from egvs.kernels import ray_triangle
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.sensors import site_feasibility
-from egvs.sensors.beam_hooks import BeamCutter, BeamExpander
+from egvs.sensors.beam_hooks import BeamCutter, BeamExpander, checked_sub_beams
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Pose, ScannedSite, Site
@@ -237,7 +237,8 @@ class Scanner:
         if sensor.beam_weight is not None:
             weight = sensor.beam_weight[start : start + len(directions)]
         for effect in self._expanders:
-            directions, parent, share = effect.expand(directions, sensor, pose)
+            sub_beams = checked_sub_beams(effect, effect.expand(directions, sensor, pose), len(directions))
+            directions, parent, share = sub_beams
             beam = beam[parent]
             weight = weight[parent] * share
         scan = cast(pose.position_m, directions, sensor.range_m)

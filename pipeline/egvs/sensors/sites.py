@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -208,8 +208,17 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
     if not sites:
         raise InputError(path, "expected at least one site, got none")
     _check_unused_keys(scenario, builder.used_keys, path)
+    poles = list(dict.fromkeys(site.pole for site in sites.values()))
+    for pole in scenario.sites.existing_poles if scenario.sites.existing_poles != "all" else ():
+        if pole not in poles:
+            raise unknown_site(f"{scenario.file}: sites.existing_poles", pole, poles)
     _check_keep_visibility(scenario, sites)
     return _with_measured_scan(tuple(sites.values()), scenario)
+
+
+def pole_exists(pole: str, existing: Sequence[str]) -> bool:
+    """Return whether a pole is one of ``sites.existing_poles``."""
+    return existing == "all" or pole in existing
 
 
 def _site_rows(scenario: Scenario, path: Path) -> tuple[Iterable[SiteRow], list[InputError]]:

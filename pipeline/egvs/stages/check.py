@@ -19,6 +19,7 @@ from egvs.stages import height_checks, name_checks, scene_checks, scene_inputs, 
 from egvs.stages import inputs as stage_inputs
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.inputs import CheckInputs, Inputs
+from egvs.stages.scene_checks import PoleSurroundings
 from egvs.stages.scene_dependencies import sensor_digests
 from egvs.traffic import traffic_sources
 from egvs.world import geolocation
@@ -81,12 +82,15 @@ class CheckReport:
         Errors and warnings, errors first.
     sites, solids, lanes
         How many were checked.
+    poles
+        Where each pole stands, from :func:`check_scenario`.
     """
 
     findings: tuple[Diagnostic, ...]
     sites: int
     solids: int
     lanes: int
+    poles: tuple[PoleSurroundings, ...] = ()
 
     @property
     def errors(self) -> tuple[Diagnostic, ...]:
@@ -130,8 +134,13 @@ class SceneReport:
 
 
 def check_scenario(scenario: Scenario) -> CheckReport:
-    """Apply every rule to a scenario; see :func:`check_inputs`."""
-    return check_inputs(Inputs(scenario))
+    """Apply every rule to a scenario, see :func:`check_inputs`, and describe where each pole stands."""
+    inputs = Inputs(scenario)
+    report = check_inputs(inputs)
+    if report.errors:
+        return report
+    readable, _ = stage_inputs.resolve_check_inputs(inputs)
+    return replace(report, poles=scene_checks.pole_surroundings(readable))
 
 
 def check_inputs(inputs: Inputs, scene: SceneReport | None = None) -> CheckReport:

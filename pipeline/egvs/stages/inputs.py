@@ -21,6 +21,7 @@ from egvs.effects import registry
 from egvs.formats import point_clouds
 from egvs.formats.georeference import Georeference
 from egvs.formats.meshes import referenced_files
+from egvs.scenario.loading import check_is_scenario
 from egvs.scenario.model import TERRAIN_KEY, Scenario
 from egvs.scoring import zones
 from egvs.sensors import sites
@@ -168,6 +169,7 @@ def build_scene(scenario: Scenario) -> Scene:
     InputError
         When the scenario, or a file that it names, is wrong.
     """
+    check_is_scenario(scenario)
     return Inputs(scenario).scene
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Hashable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
-from egvs.core.grid import Roi
+from egvs.core.grid import FloatArray, Roi
 from egvs.core.wording import by_number, format_percent, list_first, number_of, shorten_id
 from egvs.effects import registry
 from egvs.effects.base import Effect
@@ -330,6 +331,78 @@ def _describe_lane(lane: str, network: Network | None) -> str:
     node = edge_id[1:].rpartition("_")[0]
     names = dict.fromkeys(edge.name for edge in edges if edge.name and node in (edge.from_node, edge.to_node))
     return f"the junction of {' and '.join(names)}" if names else f"junction {shorten_id(node)}"
+
+
+@dataclass(frozen=True)
+class PoleSurroundings:
+    """Where a pole stands.
+
+    Attributes
+    ----------
+    pole, x_m, y_m
+        Its name, and its position in the world frame.
+    where
+        The street beside it, or the lane or junction that it stands in; empty if there is no network.
+    kerb_m
+        Distance to the edge of the carriageway; NaN if there is no network.
+    wall_m
+        Distance to the nearest surface that is not ground, tree or another pole, at most
+        :data:`MAX_WALL_M`; NaN if there is none.
+    """
+
+    pole: str
+    x_m: float
+    y_m: float
+    where: str
+    kerb_m: float
+    wall_m: float
+
+
+MAX_WALL_M = 100.0
+
+
+def pole_surroundings(inputs: CheckInputs) -> tuple[PoleSurroundings, ...]:
+    """Return where each pole stands, in the order of the sites, as far as the network and the world are known."""
+    by_pole: dict[str, Site] = {}
+    for site in inputs.sites:
+        by_pole.setdefault(site.pole, site)
+    sites = tuple(by_pole.values())
+    if not sites:
+        return ()
+    at_m = np.array([site.pose.position_m[:2] for site in sites])
+    where, kerb_m = [""] * len(sites), np.full(len(sites), np.nan)
+    if inputs.carriageway is not None and inputs.carriageway.lanes:
+        kerb_m = inputs.carriageway.kerb_distance_m(at_m)
+        on_road = {site.pole: place for site, place in _sites_on_road(sites, inputs.carriageway, inputs.network)}
+        beside: dict[int, str] = {}
+        for number, site in enumerate(sites):
+            lane = inputs.carriageway.nearest(at_m[number])
+            if lane not in beside:
+                name = _describe_lane(inputs.carriageway.names[lane], inputs.network)
+                beside[lane] = f"beside {name.removeprefix('a lane of ')}"
+            where[number] = on_road.get(site.pole, beside[lane])
+    wall_m = np.full(len(sites), np.nan) if inputs.world is None else _wall_distances_m(inputs.world, at_m)
+    rows = zip(sites, where, kerb_m.tolist(), wall_m.tolist(), strict=True)
+    return tuple(PoleSurroundings(site.pole, site.pose.x_m, site.pose.y_m, *rest) for site, *rest in rows)
+
+
+def _wall_distances_m(world: World, at_m: FloatArray) -> FloatArray:
+    """Return the distance of each point (n, 2) to the nearest wall in plan, (n,); NaN for none."""
+    import shapely
+
+    no_wall = ("ground", "tree", "vegetation", *supports.KINDS)
+    is_wall = np.array([not kind.lower().startswith(no_wall) for _, kind in world.solids], dtype=np.bool_)
+    low_m, high_m = world.bounds_xy_m
+    is_near = ((low_m <= at_m.max(axis=0) + MAX_WALL_M) & (high_m >= at_m.min(axis=0) - MAX_WALL_M)).all(axis=1)
+    faces = np.flatnonzero(is_near & is_wall[world.solid_of_face])
+    corners_m = world.triangles_m[faces][:, :, :2].reshape(-1, 2)
+    areas = shapely.convex_hull(shapely.multipoints(corners_m, indices=np.repeat(np.arange(len(faces)), 3)))
+    (numbers, _), found_m = shapely.STRtree(areas).query_nearest(
+        shapely.points(at_m), max_distance=MAX_WALL_M, return_distance=True, all_matches=False
+    )
+    distances_m = np.full(len(at_m), np.nan)
+    distances_m[numbers] = found_m
+    return distances_m
 
 
 def warn_own_supports(inputs: CheckInputs) -> Iterator[Diagnostic]:

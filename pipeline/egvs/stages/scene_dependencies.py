@@ -27,7 +27,7 @@ def scan_dependencies(context: StageContext) -> StageDependencies:
         "name": scenario.name,
         "roi": [scene.roi.origin_m, scene.roi.size_m],
         "ground": scenario.statics.ground,
-        "sites": scenario.sites.model_dump(mode="json"),
+        "sites": scenario.sites.model_dump(mode="json", exclude={"existing_poles"}),
         "sensors": sensor_settings(scenario),
     }
     settings |= geolocation.world_frame_settings(scenario)

@@ -17,6 +17,7 @@ import pyarrow as pa
 from egvs.artefacts import parquet, readers
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog
+from egvs.core import plugins
 from egvs.core.errors import WARNINGS_KEY, Diagnostic
 from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
@@ -24,7 +25,7 @@ from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
-from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED, SCORES_IN_UNITS
+from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED, SCORES_GROUP, SCORES_IN_UNITS, is_plugin_score
 from egvs.scoring import score_table, standard_errors, zones
 from egvs.scoring.score_table import ScoreTable
 from egvs.scoring.target_scores import group_score
@@ -74,6 +75,8 @@ def dependencies(context: StageContext) -> StageDependencies:
         digests |= sensor_digests(scenario, context.scene.sites)
 
     modules = registry.effect_modules(effects)
+    if is_plugin_score(scenario.score.rank_by):
+        modules += (plugins.plugin_module(SCORES_GROUP, scenario.score.rank_by),)
     if scenario.scan.keep:
         return StageDependencies(settings, digests | context.digests(RunFolder.scans.name), modules=modules)
     scans = scan_dependencies(context)
@@ -192,9 +195,12 @@ def _write_scores(
         optional["best_beats"] = behind_best.best_beats
         if ranking.has_detectors:
             optional["behind_best_detectors_se"] = behind_best.detectors_se
-    user_columns = _user_columns(context)
-    with parquet.artefact_writer(context.folder.scores, "scores", tuple(optional), extra=user_columns) as file:
-        file.write(columns | optional | user_columns)
+    extra = _user_columns(context)
+    if is_plugin_score(config.rank_by):  # the schema cannot name it
+        names = (config.rank_by, f"{config.rank_by}_se")
+        extra |= {name: pa.array(optional.pop(name)) for name in names if name in optional}
+    with parquet.artefact_writer(context.folder.scores, "scores", tuple(optional), extra=extra) as file:
+        file.write(columns | optional | extra)
         file.describe(metadata)
 
 

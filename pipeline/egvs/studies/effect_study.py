@@ -36,6 +36,7 @@ from egvs.runs import run, stage_keys, stage_registry
 from egvs.runs.run_context import open_folder
 from egvs.runs.stage_registry import RANKING_STAGES
 from egvs.scenario.effects_config import GROUP, EffectParameters
+from egvs.scenario.loading import check_is_scenario
 from egvs.scenario.model import Scenario
 from egvs.sensors.scene import Scene
 from egvs.stages.inputs import build_scene
@@ -96,6 +97,7 @@ def run_ablation(
     progress
         Called as stages proceed.
     """
+    check_is_scenario(scenario)
     effects = scenario.effects
     variants = {"none": effects.only()}
     for name in effects.named:

@@ -471,7 +471,8 @@ def _sensor_mounts(runs: Sequence[ComparedRun]) -> tuple[SensorMount, ...]:
     mounts: list[SensorMount] = []
     for run in runs:
         if _are_comparable(runs[0], run):
-            mounts += best_mounts(run.ranking.sites, run.costs, run.label)
+            existing = run.settings.get("sites.existing_poles", ())
+            mounts += best_mounts(run.ranking.sites, run.costs, run.label, existing)
     if len({mount.sensor for mount in mounts}) < 2:
         return ()
     return tuple(mounts)

@@ -427,7 +427,7 @@ def write_trajectories(
         where = recording.source or recording.where
         boxes = vehicle_boxes.boxes_from_bumpers(group, recording.sizes, period_s, where, uncounted)
         for change in changes:
-            boxes = change.change(boxes)
+            boxes = vehicle_boxes.checked_boxes(change, change.change(boxes))
         if boxes.frame.size:
             file.write(boxes.columns(first_frame, name_prefix))
         statistics.add(boxes)

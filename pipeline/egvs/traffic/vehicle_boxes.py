@@ -25,7 +25,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from egvs.artefacts.frame_boxes import MAX_BOX_M, MIN_BOX_M
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, RunError
 from egvs.traffic.fcd import FrameGroup
 
 if TYPE_CHECKING:
@@ -299,6 +299,18 @@ class BoxChange(Protocol):
 
     def summary(self) -> dict[str, Any]:
         """Return what the stage reports about the changes, as JSON."""
+
+
+def checked_boxes(change: BoxChange, boxes: object) -> VehicleBoxes:
+    """Return the boxes of a change; raise a RunError for anything else, and for arrays of different lengths."""
+    if not isinstance(boxes, VehicleBoxes):
+        raise RunError(f"{type(change).__qualname__}: expected VehicleBoxes, got {type(boxes).__name__}")
+    for name in ("frame", "code", "kind", *_NUMBERS):
+        array = getattr(boxes, name)
+        if np.shape(array) != (boxes.frame.size,):
+            problem = f"expected {name} of shape ({boxes.frame.size},), got {np.shape(array)}"
+            raise RunError(f"{type(change).__qualname__}: {problem}")
+    return boxes
 
 
 class TrafficHook(Protocol):

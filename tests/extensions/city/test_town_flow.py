@@ -62,6 +62,29 @@ def test_town_carries_its_flow_and_repeats(tmp_path):
 
 
 @pytest.mark.slow
+def test_search_continues_after_an_interruption(tmp_path, monkeypatch):
+    """Simulations that were complete are not repeated, and their result is the same."""
+    network = netgenerate(tmp_path, "--grid", "--grid.number", "2", "--grid.attach-length", "100").read_text()
+    run_sumo, simulated, steps = town_flow.capacity.run_sumo, [], []
+
+    def run(*arguments):
+        if len(simulated) == 2:
+            raise KeyboardInterrupt
+        simulated.append(arguments)
+        return run_sumo(*arguments)
+
+    monkeypatch.setattr(town_flow.capacity, "run_sumo", run)
+    with pytest.raises(KeyboardInterrupt):
+        town_flow.find_flow(network, 10.0)
+    monkeypatch.setattr(town_flow.capacity, "run_sumo", lambda *a: simulated.append(a) or run_sumo(*a))
+    found = town_flow.find_flow(network, 10.0, lambda what, *_: steps.append(what))
+    assert len(simulated) == 1 + len(found.runs)  # and light traffic, each once
+    assert steps[:2] == ["draws trips", "simulates light traffic"] and len(steps) == 2 + len(found.runs)
+    monkeypatch.setenv("EGVS_STORE", "")
+    assert town_flow.find_flow(network, 10.0) == found
+
+
+@pytest.mark.slow
 def test_first_flow_loads_busiest_junction(tmp_path):
     """All trips of a crossing pass its one junction, which has four lanes."""
     netgenerate(tmp_path, "--grid", "--grid.number", "1", "--grid.attach-length", "150", "--no-turnarounds")

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from egvs import load
+from egvs import load, write_clouds
 from egvs.clouds.simulation import CloudSimulator, sweep_rng
 from egvs.core import files
 from egvs.core.errors import InputError
@@ -270,3 +270,25 @@ def test_removes_files_of_killed_export_and_fills_empty_folder(four_sites, tmp_p
     assert code == 0 and "level" in out and "README.md" in out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"README.md", "level"}
     assert not list(tmp_path.glob(".out*"))
+
+
+def test_long_vehicles_without_class_are_no_cars(four_sites, tmp_path, run_egvs):
+    """The type of vehicle names no vClass, so SUMO's default, passenger, is that of a 12 m bus."""
+    words = ("--site", "level", "--frames", "2", "--set", "traffic.kinds.car.length_m=12")
+    code, printed, _ = run_egvs("clouds", four_sites, "--out", tmp_path / "clouds", *words)
+    names = {name for path in (tmp_path / "clouds/level/label_2").iterdir() for name in kitti.read_labels(path).names}
+    assert (code, names) == (0, {"Bus"})
+    said = re.search(r"Labelled by size: (\d+) Bus\. Their vClass is that of cars, but .* longer than 6\.5 m", printed)
+    assert said is not None and said[0] in (tmp_path / "clouds" / "README.md").read_text()
+    about = json.loads((tmp_path / "clouds" / "level" / "about.json").read_text())
+    assert about["by_size"] == about["classes"] == {"Bus": int(said[1])}
+
+
+def test_python_function_writes_the_files_of_the_command(four_sites, tmp_path, run_egvs):
+    words = ("--site", "level", "--frames", "2", "--format", "ply")
+    assert run_egvs("clouds", four_sites, "--out", tmp_path / "one", *words)[0] == 0
+    other = write_clouds(load(four_sites), str(tmp_path / "other"), sites=["level"], frames=2, kind="ply")
+    for path in (tmp_path / "one").rglob("*.*"):
+        assert (other / path.relative_to(tmp_path / "one")).read_bytes() == path.read_bytes()
+    with pytest.raises(InputError, match="is not empty"):
+        write_clouds(load(four_sites), other, frames=2)

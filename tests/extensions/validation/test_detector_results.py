@@ -14,17 +14,25 @@ from egvs.extensions.validation.detector_results import CAR_VCLASSES, DetectedBo
 
 def test_every_vclass_with_body_has_class():
     known = tomllib.loads(cloud_simulation.BODIES_FILE.read_text())["classes"]
-    assert {name for name in known if detector_results.object_class(name) == "Misc"} == set()
-    assert {name for name in known if detector_results.object_class(name) == "Car"} == CAR_VCLASSES
-    assert {detector_results.object_class(name) for name in known} | {"Trailer", "Misc"} == set(
+    assert {name for name in known if detector_results.object_class(name, 4.5) == "Misc"} == set()
+    assert {name for name in known if detector_results.object_class(name, 4.5) == "Car"} == CAR_VCLASSES
+    assert {detector_results.object_class(name, 4.5) for name in known} | {"Trailer", "Misc"} == set(
         detector_results.CLASSES
     )
 
 
 def test_rear_parts_are_trailers_except_of_buses():
-    assert [detector_results.object_class("truck", part) for part in (0, 1)] == ["Truck", "Trailer"]
-    assert [detector_results.object_class("bus", part) for part in (0, 1)] == ["Bus", "Bus"]
-    assert detector_results.object_class("ship") == "Misc"
+    assert [detector_results.object_class("truck", 4.5, part) for part in (0, 1)] == ["Truck", "Trailer"]
+    assert [detector_results.object_class("bus", 4.5, part) for part in (0, 1)] == ["Bus", "Bus"]
+    assert detector_results.object_class("ship", 4.5) == "Misc"
+
+
+@pytest.mark.parametrize(
+    ("length_m", "name"), [(4.5, "Car"), (6.5, "Car"), (7.1, "Truck"), (12, "Bus"), (16.5, "Truck")]
+)
+def test_vclass_of_cars_with_another_length_has_class_of_its_size(length_m, name):
+    assert {detector_results.object_class(vclass, length_m) for vclass in CAR_VCLASSES} == {name}
+    assert detector_results.object_class("delivery", length_m) == "Van"
 
 
 def _same(detections, again):

@@ -96,7 +96,7 @@ def new(
         centre = options.latitude_and_longitude(around, "--around")
     if radius is not None:
         radius_m = options.length_m(radius, "--radius")
-    with ProgressDisplay("city") as screen:
+    with ProgressDisplay("city", prints_progress=True) as screen:
         from egvs.extensions.city import creation, new_summary
 
         new_options = creation.NewCityOptions(
@@ -402,7 +402,8 @@ def print_comparison(comparison: PlanComparison) -> None:
 
 app = typer.Typer(no_args_is_help=True, help="Run every junction of a city, on one machine or a cluster.")
 
-for verb in (new, traffic, run, place, compare):
+app.command(cls=options.PointCommand)(new)
+for verb in (traffic, run, place, compare):
     app.command()(verb)
 
 COMMANDS = (Command("city", "Decide", app),)

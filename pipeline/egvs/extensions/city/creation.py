@@ -196,7 +196,7 @@ class NewCityOptions:
     traffic
         A key of :data:`egvs.creation.assumed_traffic.TRAFFIC_LEVELS`: the share of the flow that the network carries.
     progress
-        Called with the number of finished junctions.
+        Called at the beginning of each step, and with the number of finished junctions.
     """
 
     around: tuple[float, float] | None = None
@@ -242,6 +242,8 @@ def _create_city(folder: Path, osm: Path, options: NewCityOptions) -> NewCity:
     name = scenario_files.check_new_folder(folder)
     if radius_m is not None and around is None:
         raise InputError("--radius", "given without --around", "Add --around LAT,LON.")
+    progress = options.progress
+    progress("reads the map", 0, 0)
     extract = read_extract(osm)
     check_inside_extract(extract, around, "--around")
 
@@ -250,12 +252,14 @@ def _create_city(folder: Path, osm: Path, options: NewCityOptions) -> NewCity:
         street_extract = osm_network.cut_surroundings(extract, around, rim_m)
     side = choose_map_side(extract, side_option, around, str(osm))
     flags = osm_network.netconvert_flags(extract, lefthand=side.lefthand, walk=options.walk)
+    progress("makes the network", 0, 0)
     network, streets, turn_notes = osm_network.build_network(street_extract, osm, flags)
     within = None
     if around is not None:
         within = Point(streets.to_xy([around[1]], [around[0]])[0]).buffer(rim_m - RIM_WIDTH_M)
     choice = choose_junctions(streets, which, within)
 
+    progress("maps buildings and trees", 0, 0)
     solids, counts = osm_solids.map_solids(extract, streets)
     areas = shapely.STRtree([solid.area for solid in solids])
     made: list[NewJunction] = []
@@ -272,7 +276,7 @@ def _create_city(folder: Path, osm: Path, options: NewCityOptions) -> NewCity:
             left_out.setdefault(OVERLAPPING_REGION, []).append(street_junction.id)
         else:
             raise _overlap_error(which, divided.too_near[junction_id], junction_id)
-        options.progress("junctions", number, len(choice.junctions))
+        progress("finds poles: junction", number, len(choice.junctions))
     if not made:
         reasons = ", ".join(f"{len(ids)} {reason}" for reason, ids in left_out.items()) or "no streets meet"
         hint = "Choose another extract, or a larger --radius."
@@ -280,10 +284,11 @@ def _create_city(folder: Path, osm: Path, options: NewCityOptions) -> NewCity:
             hint = "Try --junctions all."
         raise InputError(osm, f"no junction is left ({reasons})", hint)
 
-    flow = CityFlow(find_flow(network, JUNCTION_BLOCKER_S), options.traffic)
+    flow = CityFlow(find_flow(network, JUNCTION_BLOCKER_S, progress), options.traffic)
     side_notes = side.note, *exceptions_note(extract, lefthand=side.lefthand)
     notes = (*side_notes, *turn_notes, *_import_notes(made, counts, flow, options.walk))
     city = NewCity(folder, tuple(made), left_out, streets, counts, flow, notes)
+    progress("writes the scenarios", 0, 0)
     scenario_files.publish_folder(folder, _city_files(city, name, network, solids, areas), _check_city)
     return city
 

@@ -4,22 +4,28 @@ A flow is carried if no vehicle stands for long, all find space to start, and le
 stand beyond those that also stand in light traffic. Vehicles per kilometre of lane would be the wrong measure: most
 streets are residential, and all trips use a few main roads.
 
-The same network gives the same result.
+The same network gives the same result. The result of each simulation is cached (:mod:`egvs.runs.store`), so a search
+that was interrupted continues after the last complete simulation.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from egvs.core import files
+from egvs.core import files, reading
+from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.resource_usage import measure_usage
+from egvs.runs.stage_keys import source_digest
+from egvs.runs.stage_registry import StageResult
+from egvs.runs.store import Store
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.traffic import demand, sumo_folder, town_trips
-from egvs.traffic.capacity import MAX_STANDING_S, MAX_WAITING, StandingVehicles, run_sumo
+from egvs.traffic import capacity, demand, sumo, sumo_folder, town_trips
+from egvs.traffic.capacity import MAX_STANDING_S, MAX_WAITING
 from egvs.traffic.network import Edge, read_net_xml
 
 FLOW_DURATION_S, FLOW_WARMUP_S, FLOW_STEP_S = 1500.0, 600.0, 1.0
@@ -41,6 +47,11 @@ LIGHT_SHARE = 0.1
 """Light traffic is this share of the first flow."""
 
 _LOAD_TRIPS, _MIN_LIGHT_PER_H = 3000, 100
+
+TRIAL_KIND = "trial"
+"""Kind of the entries of the store with the results of simulations."""
+
+_TRIAL_FILE = "trial.json"
 
 _TRIAL_WHERE = "random trips"
 """In messages, instead of the traffic table of a scenario."""
@@ -79,6 +90,15 @@ class FlowTrial:
 
 
 @dataclass(frozen=True)
+class _TrialResult:
+    """What a simulation gave: as :class:`FlowTrial`, with the share of the vehicles that stand."""
+
+    longest_standing_s: float
+    share_at_rest: float
+    waiting: int
+
+
+@dataclass(frozen=True)
 class FlowCapacity:
     """The flow that a town carries, whether it needs ``traffic.reroute_at_departure``, and the trial's simulations."""
 
@@ -92,7 +112,7 @@ class FlowCapacity:
         return any(run.is_carried for run in self.runs)
 
 
-def find_flow(network: str, junction_blocker_s: float) -> FlowCapacity:
+def find_flow(network: str, junction_blocker_s: float, progress: ProgressCallback = no_progress) -> FlowCapacity:
     """Find how many random trips per hour a town carries.
 
     Routes on empty streets give a first flow, at which the busiest junction has :data:`FIRST_LOAD` of
@@ -106,6 +126,8 @@ def find_flow(network: str, junction_blocker_s: float) -> FlowCapacity:
         The SUMO network, as text.
     junction_blocker_s
         As in ``[traffic]``.
+    progress
+        Called before each simulation.
 
     Raises
     ------
@@ -114,12 +136,15 @@ def find_flow(network: str, junction_blocker_s: float) -> FlowCapacity:
     """
     with files.temporary_folder() as folder:
         files.write_text(folder / sumo_folder.NETWORK_FILE, network)
+        progress("draws trips", 0, 0)
         trial = _TownTrial(folder, junction_blocker_s)
         per_h, reroute = trial.first_flow(), True
+        progress("simulates light traffic", 0, 0)
         trial.run_light_traffic(per_h)
         carried: FlowTrial | None = None
         too_much = math.inf
         while len(trial.runs) < MAX_FLOW_RUNS:
+            progress(f"simulates {per_h:,} vehicles an hour: trial", len(trial.runs) + 1, MAX_FLOW_RUNS)
             run = trial.run(per_h, reroute)
             if run.is_carried:
                 carried = run
@@ -178,17 +203,17 @@ class _TownTrial:
     def run_light_traffic(self, first_per_h: int) -> None:
         """Measure which share of the vehicles stands in light traffic."""
         per_h = max(_MIN_LIGHT_PER_H, round(LIGHT_SHARE * first_per_h))
-        self._share_in_light_traffic = self._simulate(per_h, True)[0].share_at_rest
+        self._share_in_light_traffic = self._simulate(per_h, True).share_at_rest
 
     def run(self, per_h: int, reroute: bool) -> FlowTrial:
         """Simulate a flow."""
-        standing, waiting = self._simulate(per_h, reroute)
-        share_queuing = round(max(0.0, standing.share_at_rest - self._share_in_light_traffic), 4)
-        run = FlowTrial(per_h, reroute, standing.longest_s, waiting, share_queuing)
+        result = self._simulate(per_h, reroute)
+        share_queuing = round(max(0.0, result.share_at_rest - self._share_in_light_traffic), 4)
+        run = FlowTrial(per_h, reroute, result.longest_standing_s, result.waiting, share_queuing)
         self.runs.append(run)
         return run
 
-    def _simulate(self, per_h: int, reroute: bool) -> tuple[StandingVehicles, int]:
+    def _simulate(self, per_h: int, reroute: bool) -> _TrialResult:
         count = math.ceil(FLOW_DURATION_S * per_h / 3600.0)
         if count > self._n_trips:
             self._draw(count)
@@ -196,7 +221,27 @@ class _TownTrial:
         departing = [trip for trip in self._routed if trip.number < count]
         files.write_text(self._folder / sumo_folder.TRIPS_FILE, demand.routes_xml(departing, departs_s))
         options = self._options | (demand.REROUTE_OPTIONS if reroute else {})
-        return run_sumo(self._folder, FLOW_DURATION_S, FLOW_WARMUP_S, options)
+        return self._run_or_take(options)
+
+    def _run_or_take(self, options: dict[str, str]) -> _TrialResult:
+        """Simulate the routes in the folder, unless the store has the result."""
+        names = (sumo_folder.NETWORK_FILE, sumo_folder.VTYPES_FILE, sumo_folder.TRIPS_FILE)
+        key = files.hash_json({
+            "files": {name: files.hash_file(self._folder / name) for name in names}, "options": options,
+            "times_s": [FLOW_DURATION_S, FLOW_WARMUP_S], "sumo": sumo.sumo_version(),
+            "source": source_digest(capacity.__name__).digest,
+        })  # fmt: skip
+        store = Store.default()
+        with store.maker(TRIAL_KIND, key):
+            if store.take(TRIAL_KIND, key, self._folder) is not None:
+                return _TrialResult(**reading.read_json(self._folder / _TRIAL_FILE))
+            with measure_usage() as cost:
+                standing, waiting = capacity.run_sumo(self._folder, FLOW_DURATION_S, FLOW_WARMUP_S, options)
+            result = _TrialResult(standing.longest_s, standing.share_at_rest, waiting)
+            files.write_text(self._folder / _TRIAL_FILE, files.to_json_text(asdict(result)))
+            digest = files.hash_file(self._folder / _TRIAL_FILE)
+            store.put(TRIAL_KIND, key, self._folder, StageResult({_TRIAL_FILE: digest}, {}, {}, cost))
+        return result
 
     def _draw(self, count: int) -> None:
         """Draw and route trips, at least as many as a number."""

@@ -41,7 +41,7 @@ from egvs.extensions.validation.dataset_files import (
     SiteSummary,
     write_site,
 )
-from egvs.extensions.validation.detector_results import CLASSES
+from egvs.extensions.validation.detector_results import CLASSES, MAX_CAR_LENGTH_M
 from egvs.extensions.validation.held_out_traffic import HeldOutTraffic
 from egvs.runs import locks
 from egvs.scenario.model import Scenario
@@ -286,9 +286,7 @@ def _files_section(layout: Layout, sites: Sequence[SiteSummary]) -> str:
 
 
 def _labels_section(sites: Sequence[SiteSummary]) -> str:
-    total: Counter[str] = Counter()
-    for site in sites:
-        total.update(site.classes)
+    total = sum((site.classes for site in sites), Counter[str]())
     rows = [
         "## Labels and classes\n",
         "Every box with at least one point is labelled, also outside the region of interest, so that no visible vehicle"
@@ -297,7 +295,21 @@ def _labels_section(sites: Sequence[SiteSummary]) -> str:
         "| class | labelled boxes |\n|---|---:|",
         *(f"| {name} | {total[name]} |" for name in CLASSES if total[name]),
     ]
+    if by_size := describe_classes_by_size(sites):
+        rows.append(f"\n{by_size}")
     return "\n".join(rows) + "\n"
+
+
+def describe_classes_by_size(sites: Sequence[SiteSummary]) -> str:
+    """Return which labels follow from the size of boxes, as a sentence; empty if none does."""
+    total = sum((site.by_size for site in sites), Counter[str]())
+    if not total:
+        return ""
+    counts = ", ".join(f"{total[name]:,} {name}" for name in CLASSES if total[name])
+    return (
+        f"Labelled by size: {counts}. Their vClass is that of cars, but they are longer than {MAX_CAR_LENGTH_M:g} m; "
+        "set vclass in traffic.kinds, or vClass in the vehicle types."
+    )
 
 
 def _method_section(record: HeldOutTraffic, sites: Sequence[SiteSummary]) -> str:

@@ -252,8 +252,8 @@ class SiteSummary:
     boxes, labelled, in_roi, in_roi_labelled
         Number of boxes of all frames; of those with at least one point; of vehicles whose centre is in the region of
         interest; of those of them with at least one point.
-    classes
-        Number of labelled boxes by class.
+    classes, by_size
+        Number of labelled boxes by class; of those whose vClass is that of cars, and which are too long for one.
     pasted
         Number of boxes in training frames with at least :data:`MIN_POINTS_TO_PASTE` points, by class.
     anchors
@@ -277,6 +277,7 @@ class SiteSummary:
     in_roi: int = 0
     in_roi_labelled: int = 0
     classes: Counter[str] = field(default_factory=Counter)
+    by_size: Counter[str] = field(default_factory=Counter)
     pasted: Counter[str] = field(default_factory=Counter)
     anchors: dict[str, list[float]] = field(default_factory=dict)
     low_m: list[float] = field(default_factory=list)
@@ -306,7 +307,11 @@ class SiteSummary:
         self.labelled += int(visible.sum())
         self.in_roi += int(frame.in_roi.sum())
         self.in_roi_labelled += int((visible & frame.in_roi).sum())
-        self.classes.update(frame.classes[row] for row in np.flatnonzero(visible))
+        for row in np.flatnonzero(visible):
+            self.classes[frame.classes[row]] += 1
+            is_car = frame.frame.kinds[row] in detector_results.CAR_VCLASSES
+            if is_car and frame.classes[row] not in ("Car", "Trailer"):
+                self.by_size[frame.classes[row]] += 1
         if in_training:
             rows = np.flatnonzero(frame.points_on_box >= MIN_POINTS_TO_PASTE)
             self.pasted.update(frame.classes[row] for row in rows)

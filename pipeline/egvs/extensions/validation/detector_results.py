@@ -1,11 +1,14 @@
 """Classes of objects, and the files of what detectors found.
 
-The class of a box follows from its SUMO vClass. Where KITTI has a name for the class, that name is used:
+The class of a box follows from its SUMO vClass. SUMO's default vClass is passenger, also for types of buses and trucks
+that name none; so a box with the vClass of a car that is too long for one has the class of its size. Where KITTI has a
+name for the class, that name is used:
 
 ======================================================================== ==============
 SUMO vClass                                                              class
 ======================================================================== ==============
 passenger, taxi, evehicle, hov, private, vip, authority                  ``Car``
+the same, longer than 6.5 m; from 10 to 15 m                             ``Truck``; ``Bus``
 delivery, emergency                                                      ``Van``
 truck, trailer, army                                                     ``Truck``
 the rear parts of an articulated vehicle, except of a bus or a tram      ``Trailer``
@@ -32,6 +35,7 @@ import numpy as np
 
 from egvs.artefacts import parquet
 from egvs.artefacts.traffic_frames import BOX_COLUMNS, TrafficFrame
+from egvs.clouds.simulation import BUS_LENGTHS_M
 from egvs.clouds.sweeps import Detections
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray, Roi
@@ -63,17 +67,22 @@ _CLASS_BY_VCLASS = {
 }
 
 
-def object_class(vclass: str, part: int = 0) -> str:
+MAX_CAR_LENGTH_M = 6.5
+
+
+def object_class(vclass: str, length_m: float, part: int = 0) -> str:
     """Return the class of a box; ``part`` is above 0 for the rear parts of an articulated vehicle."""
     name = _CLASS_BY_VCLASS.get(vclass, "Misc")
     if part and name not in ("Bus", "Tram"):
         return "Trailer"
+    if vclass in CAR_VCLASSES and length_m > MAX_CAR_LENGTH_M:
+        return "Bus" if BUS_LENGTHS_M[0] <= length_m <= BUS_LENGTHS_M[1] else "Truck"
     return name
 
 
 def frame_classes(frame: TrafficFrame) -> tuple[str, ...]:
     """Return the class of each box of a frame."""
-    return tuple(object_class(kind, part) for kind, part in zip(frame.kinds, frame.part.tolist(), strict=True))
+    return tuple(map(object_class, frame.kinds, frame.boxes[:, 3].tolist(), frame.part.tolist()))
 
 
 def detections_in_roi(detections: Detections, roi: Roi) -> Detections:

@@ -3,7 +3,8 @@
 A surrogate score is a number for a site that is meant to predict how well a detector works there. It is a
 :class:`SurrogateScore`, declared as an entry point of the group ``egvs.scores`` (``name = "module:OBJECT"``), and a
 function of the :class:`SiteEvidence` of a site: its empty scan, and the traffic of the TPOG. Held-out traffic, which
-sites are evaluated with, is not part of the evidence.
+sites are evaluated with, is not part of the evidence. A :class:`egvs.scoring.target_scores.VehicleScore` of that group,
+by which sites can also be ranked, counts with its mean over vehicles.
 
 Steps: compute the static world, the empty scans and the traffic of the scenario, or restore them from the store. For
 each voxel size compute the TPOG; for each, with and without moving occlusion as scores require, the hits of each site;
@@ -46,8 +47,10 @@ from egvs.runs.run import ensure_stages
 from egvs.runs.run_context import open_folder
 from egvs.scenario.effects_config import MovingOcclusionParameters
 from egvs.scenario.model import Scenario
+from egvs.scenario.score_config import SCORES_GROUP
 from egvs.scoring import targets
 from egvs.scoring.egvs import EntropyField
+from egvs.scoring.target_scores import VehicleScore, load_vehicle_score
 from egvs.scoring.targets import TargetRecord, VisibleTargets
 from egvs.scoring.visibility import Beams, HitCounter, Hits
 from egvs.sensors import voxel_crossings
@@ -226,8 +229,6 @@ class SiteEvidence:
 
 # ---- installed scores
 
-SCORES_GROUP = "egvs.scores"
-
 _BUILTIN_SCORES = (
     "egvs", "entropy_seen", "coverage", "expected_visibility", "s_mig", "m_sog", "kl_obs", "density", "uniformity",
     "nuc", "perception_entropy", "vehicle_grid_occupancy", "points_on_target", "seen_well", "expected_detections",
@@ -283,10 +284,21 @@ def load_score(name: str, location: str = "--score") -> SurrogateScore:
     if name not in score_names():
         raise InputError(location, f"unknown score {name!r}", f"Use one of {', '.join(score_names())}.")
     loaded = plugins.load_plugin(SCORES_GROUP, name)
+    if isinstance(loaded, VehicleScore):
+        return _surrogate_of_vehicles(load_vehicle_score(name))
     if problem := _invalid_score_reason(name, loaded):
         raise plugins.plugin_error(SCORES_GROUP, name, problem)
     score: SurrogateScore = loaded
     return score
+
+
+def _surrogate_of_vehicles(score: VehicleScore) -> SurrogateScore:
+    """Return a score of vehicles as a score of sites."""
+
+    def site_score(evidence: SiteEvidence) -> float:
+        return targets.weighted_mean(score(evidence.vehicles))
+
+    return SurrogateScore(score.name, score.formula, score.source, 1, site_score, needs=("vehicles",))
 
 
 def _invalid_score_reason(name: str, loaded: object) -> str:

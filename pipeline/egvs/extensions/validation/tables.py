@@ -242,6 +242,8 @@ def _format_precision(name: str, entry: Mapping[str, float]) -> str:
 
 def print_export(dataset: WrittenDataset) -> None:
     """Print what was written for each site."""
+    from egvs.extensions.validation.dataset import describe_classes_by_size
+
     columns: list[Column[Any]] = [
         Column("site", lambda site: site.site, "left"),
         Column("sensor", lambda site: site.sensor, "left", wrap=True),
@@ -252,6 +254,8 @@ def print_export(dataset: WrittenDataset) -> None:
         Column("of them labelled", lambda site: str(site.in_roi_labelled), wrap=True),
     ]
     print_table(columns, dataset.sites, file_width=_FILE_WIDTH)
+    if by_size := describe_classes_by_size(dataset.sites):
+        print(by_size)
     print(f"{dataset.folder}/README.md describes the files ({dataset.kind})")
 
 
