@@ -8,7 +8,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # Every process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run environment test test-slow test-nightly without test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics pictures schema reference docs notebooks fuzz clean
+.PHONY: run environment test test-slow test-nightly without test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics docs-figures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -120,8 +120,9 @@ scaling: $(VENV)/.installed-dev
 numerics: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.numerics --csv docs/data/numerics.csv
 
-pictures: $(VENV)/.installed-dev
-	$(BIN)/python -m benchmarks.pictures
+# The pictures of README and docs, and the printed output that pages quote. ONLY: names of some
+docs-figures: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.docs_figures $(if $(ONLY),--only $(ONLY))
 
 # Executes docs/notebooks/*.ipynb and writes their outputs; NOTEBOOKS: names of some, or "--to FOLDER"
 notebooks: $(VENV)/.installed-notebooks

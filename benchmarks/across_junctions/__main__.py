@@ -132,6 +132,8 @@ def _parser() -> argparse.ArgumentParser:
     step.add_argument(
         "--order", action="store_true", help="order of sites at held-out junctions of the larger study without maps"
     )
+    step.add_argument("--frames", type=int, help="fewer than the streets have: a trial, which writes below --data only")
+    step.add_argument("--candidates", type=int, help="fewer than are measured: a trial, too")
     step.add_argument("--out", type=Path, default=ROOT / "docs" / "data", metavar="DIR", help="for the tables")
     step.add_argument("--jobs", type=int, help="processes; default: one a core")
     step.set_defaults(step=_levels)
@@ -227,12 +229,21 @@ def _levels(arguments: argparse.Namespace) -> int:
     if arguments.order:
         return _order(arguments)
     protocol = read_protocol(streets.STREETS_FILE)
+    data, out, corrections = arguments.data, arguments.out, CORRECTIONS_FILE
+    if arguments.frames is not None or arguments.candidates is not None:
+        protocol = streets.shortened(protocol, arguments.frames)
+        out = data = data / f"trial_{arguments.frames or 'all'}_frames_{arguments.candidates or 'all'}_candidates"
+        corrections = data / CORRECTIONS_FILE.name
     start_s = time.monotonic()
     rows = {}
     for junction in _selected(protocol, arguments.junction, protocol.junctions):
-        progress = _progress(junction.name, start_s)
         rows[junction.name] = streets.measure(
-            protocol, junction, arguments.data, jobs=arguments.jobs, progress=progress
+            protocol,
+            junction,
+            data,
+            candidates=arguments.candidates or streets.CANDIDATES,
+            jobs=arguments.jobs,
+            progress=_progress(junction.name, start_s),
         )
         print(f"{time.monotonic() - start_s:6.0f} s  {junction.name}", flush=True)
     if arguments.junction is not None:
@@ -244,10 +255,12 @@ def _levels(arguments: argparse.Namespace) -> int:
     if arguments.fit:
         print(levels.comparison_text(levels.compare(fitting)))
         models = levels.models_by(levels.CHOSEN, fitting)
-        files.write_text(CORRECTIONS_FILE, levels.corrections_text(models, fitting))
+        files.write_text(corrections, levels.corrections_text(models, fitting))
+    else:
+        models = levels.corrected_models()
     table = [*levels.table(others, levels.uncorrected_models(), "uncorrected"),
-             *levels.table(others, levels.corrected_models(), "corrected")]  # fmt: skip
-    files.write_text(arguments.out / "street_levels.csv", levels.table_text(table))
+             *levels.table(others, models, "corrected")]  # fmt: skip
+    files.write_text(out / "street_levels.csv", levels.table_text(table))
     print(levels.summary_text(table))
     return 0
 

@@ -95,12 +95,21 @@ class StreetRows:
     points: FloatArray
 
 
+def shortened(protocol: Protocol, frames: int | None) -> Protocol:
+    """Return the protocol with fewer frames at all junctions, for a trial."""
+    if frames is None:
+        return protocol
+    junctions = tuple(junction.model_copy(update={"frames": None}) for junction in protocol.junctions)
+    return protocol.model_copy(update={"frames": frames, "training_frames": frames, "junctions": junctions})
+
+
 def measure(
     protocol: Protocol,
     junction: Junction,
     folder: Path,
     *,
     losses: bool = True,
+    candidates: int = CANDIDATES,
     jobs: int | None = None,
     progress: ProgressCallback = no_progress,
 ) -> StreetRows:
@@ -112,19 +121,21 @@ def measure(
         For worlds and records.
     losses
         Whether losses of returns are simulated where the program's rule calls for them; never otherwise.
+    candidates
+        How many of the candidates are measured.
     """
     record = folder / (junction.name + ("" if losses else ".without_losses"))
     if not record.with_suffix(f"{record.suffix}.sites.parquet").is_file():
-        _measure(protocol, junction, folder / "worlds", record, losses, jobs, progress)
+        _measure(protocol, junction, folder / "worlds", record, losses, candidates, jobs, progress)
     return read_rows(junction.name, record)
 
 
 def _measure(
-    protocol: Protocol, junction: Junction, worlds: Path, record: Path, losses: bool, jobs: int | None,
+    protocol: Protocol, junction: Junction, worlds: Path, record: Path, losses: bool, count: int, jobs: int | None,
     progress: ProgressCallback,
 ) -> None:  # fmt: skip
     scenario = load(make_world(protocol, junction, None, worlds), [] if losses else ["effects.range_limit=false"])
-    candidates = list(candidates_of(protocol, junction, scenario, worlds))[:CANDIDATES]
+    candidates = list(candidates_of(protocol, junction, scenario, worlds))[:count]
     detectors = {name: base.make_detector(name) for name in protocol.detectors_of(junction)}
     with tempfile.TemporaryDirectory(prefix=".work-", dir=worlds) as temporary:
         scenario = with_sites(scenario, candidates, Path(temporary) / "sites.csv")

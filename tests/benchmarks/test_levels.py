@@ -6,12 +6,14 @@ import csv
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from benchmarks.across_junctions import levels, streets
-from benchmarks.across_junctions.protocol import read_protocol
+from benchmarks.across_junctions.__main__ import main
+from benchmarks.across_junctions.protocol import Junction, Protocol, read_protocol
 from benchmarks.across_junctions.streets import StreetRows
 
 from egvs.results.study_results import STUDY
@@ -94,6 +96,40 @@ def test_the_file_of_corrections_is_what_the_program_applies(tmp_path: Path, mon
     entry = target_scores.corrected_entry(levels.shipped_model("cluster"), correction)
     expected = levels.chances(models["cluster"], rows)
     np.testing.assert_array_equal(levels.chances(entry, rows), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_a_trial_writes_into_its_own_folder_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = set()
+
+    def measure(protocol: Protocol, junction: Junction, folder: Path, *, candidates: int, **_: object) -> StreetRows:
+        folder.mkdir(exist_ok=True)
+        measured.add((folder, candidates, protocol.frames_of(junction)))
+        rows = street(np.array([[0.0] * 300 + [1.0] * 300] * 2), np.linspace([0.1, 0.1], [5.0, 2.0], 600, axis=1))
+        return replace(
+            rows, hits=dict.fromkeys(DETECTORS, rows.hits["cluster"]), ap=dict.fromkeys(DETECTORS, np.arange(2.0))
+        )
+
+    monkeypatch.setattr(streets, "measure", measure)
+    monkeypatch.setattr(levels, "shipped_model", lambda _: STUMP)
+    before = target_scores.CORRECTIONS_FILE.read_bytes()
+    options = [
+        "--fit",
+        "--frames",
+        "20",
+        "--candidates",
+        "2",
+        "--data",
+        str(tmp_path),
+        "--out",
+        str(tmp_path / "tables"),
+    ]
+    assert main(["levels", *options]) == 0
+    ((folder, *shortened),) = measured
+    assert shortened == [2, 20]
+    assert {path.name for path in folder.iterdir()} == {"street_levels.csv", "street_corrections.json"}
+    assert target_scores.CORRECTIONS_FILE.read_bytes() == before and list(tmp_path.iterdir()) == [folder]
 
 
 def test_features_of_streets_are_those_of_the_program() -> None:

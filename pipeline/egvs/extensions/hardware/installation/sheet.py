@@ -78,7 +78,7 @@ class SheetData:
     lon_lat_deg
         Longitude and latitude (WGS 84); None if the position on the Earth is unknown.
     convergence_deg
-        Meridian convergence; NaN if the position on the Earth is unknown.
+        Grid convergence (of meridians); NaN if the position on the Earth is unknown.
     zero_height_m
         Height of z = 0 of the world frame.
     tolerances
@@ -144,7 +144,7 @@ class SheetData:
         if self.lon_lat_deg is not None:
             rows += [
                 ("", f"{format_angle(self.true_bearing_deg)} from true north"),
-                ("Meridian convergence", f"{self.convergence_deg:+z.3f}° (grid north from true north)"),
+                ("Grid convergence", f"{self.convergence_deg:+z.3f}° (grid north from true north)"),
             ]
         tilt = f"{format_angle(abs(pose.pitch_deg))} {'up' if pose.pitch_deg > 0 else 'down'}"
         if pose.pitch_deg == 0:

@@ -22,8 +22,8 @@ FINEST_M = 0.15  # triangles are subdivided to this size, so that sorting by dis
 GAP_M, ROW_M, LABEL_M = 0.8, 7.0, 4.3
 
 
-def draw(path: Path) -> None:
-    """Draw all bodies."""
+def draw(folder: Path, images: Path) -> None:
+    """Draw all bodies; nothing is run in the folder."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -53,7 +53,7 @@ def draw(path: Path) -> None:
     axes.margins(0.02)
     axes.set_ylim(-ROW_M * (len(ROWS) - 1) - 5.0, 2.8)
     axes.axis("off")
-    figure.savefig(path, metadata={"Software": None}, bbox_inches="tight")
+    figure.savefig(images / "bodies.png", metadata={"Software": None}, bbox_inches="tight")
     plt.close(figure)
 
 

@@ -1,19 +1,12 @@
-"""Draw the pictures of the explorer for docs and README: the page over nishishinjuku, in a headless browser.
-
-The pictures ``view`` and ``view-dark`` show the page of one file (``make docs`` writes it as ``build/view.html``); the
-others show the page of a running explorer.
-
-    python -m benchmarks.explorer_pictures [--only explore-3-lanes] [--out docs/images]
+"""Pictures of the explorer and of the page of one file over nishishinjuku, in a headless browser.
 
 Needs Chromium and playwright. Software rendering takes a minute or two.
 """
 
 from __future__ import annotations
 
-import argparse
 import io
 import shutil
-import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,14 +17,14 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-import egvs
+from benchmarks.docs_figures.printed import ROOT
 from egvs.explore.page import Page
 from egvs.explore.page_file import write_page_file
 from egvs.explore.settings import open_session
 from egvs.explore.view_state import Camera
 from egvs.sensors.sites import Pose
 
-SCENARIO = Path("scenarios/nishishinjuku")
+SCENARIO = ROOT / "scenarios" / "nishishinjuku"
 GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 HIDE_NOTIFICATIONS = ".mantine-Notifications-root { display: none }"
 """Style: viser warns of software rendering."""
@@ -42,7 +35,6 @@ MOVED: dict[str, Any] = {"from": "c03", "pose": Pose(196.6, 251.7, 2.0, 0.0, 1.0
 
 PICTURES: dict[str, tuple[Camera, dict[str, Any]]] = {
     "explore": (ABOVE, {"layer": "missed", **MOVED}),
-    "explore-dark": (ABOVE, {"layer": "missed", **MOVED, "is_dark": True}),
     "explore-1-opened": (ABOVE, {"layer": "traffic"}),
     "explore-2-moved": (ABOVE, {"layer": "seen", **MOVED}),
     "explore-3-lanes": (ABOVE, {"layer": "blindspots", **MOVED}),
@@ -59,33 +51,28 @@ COLOUR_STEP = 4
 """Colours are rounded to multiples of this, which halves the size of the file."""
 
 
-def main() -> None:
-    """Draw all pictures, or some."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    names = [*PAGE_FILE_PICTURES, *PICTURES]
-    parser.add_argument("--only", nargs="*", choices=names, default=names)
-    parser.add_argument("--page", type=Path, help="a page of one file; a new one by default")
-    parser.add_argument("--run", type=Path, help="a run folder with a plan; a new run by default")
-    parser.add_argument("--out", type=Path, default=Path("docs/images"))
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as scratch:
-        if pages := [name for name in PAGE_FILE_PICTURES if name in options.only]:
-            _draw_page_file(options.page or _write_page(Path(scratch)), pages, options.out)
-        if not set(options.only) & set(PICTURES):
-            return
-        run = options.run or Path(scratch) / "run"
-        if not (run / "placement.parquet").is_file():
-            egvs.place(egvs.load(SCENARIO, ["placement.count=2"]), run)
-        with _tab(Path(scratch), run) as (page, tab):
-            for name, (camera, view) in PICTURES.items():
-                if name in options.only:
-                    _draw(page, tab, camera, view, options.out / f"{name}.png")
+FILES = tuple(f"{name}.png" for name in [*PAGE_FILE_PICTURES, *PICTURES])
 
 
-def _write_page(scratch: Path) -> Path:
-    run = scratch / "run_without_plan"
-    egvs.run(egvs.load(SCENARIO), run)
-    return write_page_file(open_session(SCENARIO, (), run), scratch / "page.html").path
+def draw(run: Path, scratch: Path, images: Path) -> None:
+    """Draw the page of one file without a plan, and the explorer with one.
+
+    Parameters
+    ----------
+    run
+        A run folder with a plan.
+    scratch
+        An empty folder.
+    images
+        Where pictures are written.
+    """
+    without_plan = scratch / "run"
+    shutil.copytree(run, without_plan, ignore=shutil.ignore_patterns("placement.parquet", "curve.parquet"))
+    page = write_page_file(open_session(SCENARIO, (), without_plan), scratch / "page.html").path
+    _draw_page_file(page, list(PAGE_FILE_PICTURES), images)
+    with _tab(scratch, run) as (running, tab):
+        for name, (camera, view) in PICTURES.items():
+            _draw(running, tab, camera, view, images / f"{name}.png")
 
 
 def _draw_page_file(page: Path, names: list[str], out: Path) -> None:
@@ -108,7 +95,6 @@ def _save(picture: Image.Image, path: Path) -> None:
     shown = np.asarray(picture.convert("RGB")).astype(int)
     rounded = np.minimum((shown + COLOUR_STEP // 2) // COLOUR_STEP * COLOUR_STEP, 255)
     Image.fromarray(rounded.astype(np.uint8)).save(path, optimize=True)
-    print(path)
 
 
 @contextmanager
@@ -155,7 +141,3 @@ def _draw(page: Page, tab: Any, camera: Camera, view: dict[str, Any], path: Path
     client.camera.look_at = np.subtract(camera.at_m, page.zero_m)
     tab.wait_for_timeout(15_000)  # drawn in software
     _save(Image.open(io.BytesIO(tab.screenshot(timeout=120_000))), path)
-
-
-if __name__ == "__main__":
-    main()

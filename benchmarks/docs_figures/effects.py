@@ -1,15 +1,8 @@
-"""Draw the pictures of README and docs.
-
-``make pictures`` draws the bodies of vehicles, runs the shipped scenarios, and draws the map of the README (from the
-report) and, for each effect, the score of columns (or the occupancy, for effects on traffic) before and after, on one
-colour scale.
-"""
+"""Pictures of effects, before and after: the score of columns, or the occupancy of effects on traffic."""
 
 from __future__ import annotations
 
 import math
-import re
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import egvs
-from benchmarks import bodies_picture
+from benchmarks.docs_figures.printed import ROOT
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import read_trajectories
@@ -36,9 +29,6 @@ from egvs.scoring.scorer import Scorer
 from egvs.stages.site_scans import empty_scans
 from egvs.world.mesh import read_ply
 
-ROOT = Path(__file__).resolve().parent.parent
-IMAGES = ROOT / "docs" / "images"
-
 # effect -> scenario, parameters, site: strong enough to see
 EXAMPLES: dict[str, tuple[str, dict[str, Any], str]] = {
     "range_limit": ("nishishinjuku", {"reflectivity": 0.02}, "c08"),
@@ -52,12 +42,6 @@ EXAMPLES: dict[str, tuple[str, dict[str, Any], str]] = {
     "articulated": ("hill", {}, ""),
     "pedestrians_bicycles": ("hill", {}, ""),
 }
-
-
-def figure(page: str, label: str) -> str:
-    """Return the figure of a report whose accessible label begins with ``label``, as a separate file."""
-    figure = next(svg for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL) if f'aria-label="{label}' in svg)
-    return standalone_svg(figure)
 
 
 def column_scores(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarray]:
@@ -125,24 +109,17 @@ def side_view(out: Path, pitched: bool) -> str:
     return f'{head} aria-label="slope, {words}">{text}{words}; heights x 5</text>{"".join(shapes)}</svg>\n'
 
 
-def main() -> None:
-    """Draw all pictures."""
+FILES = tuple(f"effects/{name}-{word}.svg" for name in [*EXAMPLES, "slope"] for word in ("before", "after"))
+
+
+def draw(folder: Path, images: Path) -> None:
+    """Run the scenarios of :data:`EXAMPLES` with and without each effect, and draw both."""
     in_clouds_only = {name for name in registry.effect_names() if registry.load_effect_class(name).STAGE == "clouds"}
     assert set(EXAMPLES) == set(registry.effect_names()) - set(AUTO_ENABLED) - in_clouds_only  # slopes are always on
-    (IMAGES / "effects").mkdir(parents=True, exist_ok=True)
-    bodies_picture.draw(IMAGES / "bodies.png")
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        egvs.run(egvs.load(ROOT / "scenarios" / "nishishinjuku"), folder / "report")
-        page = (folder / "report" / "report.html").read_text(encoding="utf-8")
-        (IMAGES / "nishishinjuku.svg").write_text(figure(page, "Map of"), encoding="utf-8")
-        for name in EXAMPLES:
-            for file, drawn in before_and_after(name, folder):
-                (IMAGES / "effects" / file).write_text(drawn, encoding="utf-8")
-        for word, pitched in (("before", False), ("after", True)):
-            drawn = side_view(folder / "hill" / "plain", pitched)
-            (IMAGES / "effects" / f"slope-{word}.svg").write_text(drawn, encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    (images / "effects").mkdir(parents=True, exist_ok=True)
+    for name in EXAMPLES:
+        for file, drawn in before_and_after(name, folder):
+            (images / "effects" / file).write_text(drawn, encoding="utf-8")
+    for word, pitched in (("before", False), ("after", True)):
+        drawn = side_view(folder / "hill" / "plain", pitched)
+        (images / "effects" / f"slope-{word}.svg").write_text(drawn, encoding="utf-8")
