@@ -64,7 +64,7 @@ SITES = "site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n"
 
 LONGEST = (
     "tests/install/",
-    "tests/extensions/hardware/installation/test_story",
+    "tests/docs/test_printed.py::test_program_prints",
     "tests/extensions/maps/test_round_trip_scores",
     "tests/studies/test_accuracy",
     "tests/test_architecture.py::test_each_public_name",

@@ -118,9 +118,6 @@ def main() -> int:
 
 def _print(session: Session, folder: Path) -> None:
     """Run the commands of a session and store what they print."""
-    if not session.is_possible:
-        print(f"{session.name}: stays, because {session.needs} is not there")
-        return
     print(f"{session.name}: {len(session.commands)} commands", flush=True)
     PRINTED.mkdir(parents=True, exist_ok=True)
     session.file.write_text(session.printed(folder), encoding="utf-8")

@@ -33,8 +33,6 @@ PRINTED = DOCS / "printed"
 SCORES = PRINTED / "scores.json"
 """Scores of sessions, and those that pictures were drawn from."""
 
-REAL = ROOT.parent / "shared" / "real"
-"""Recordings and maps that are not shipped."""
 
 _TIMES = re.compile(r"^(\w[\w ]*?) +(?:[\d.,]+ s|from store|unchanged) +", re.MULTILINE)
 _SIZE = re.compile(r"^(report +)[\d,]+ [kM]B", re.MULTILINE)
@@ -61,8 +59,6 @@ class Session:
         Runs the commands in a folder and returns what each prints; by default, in processes of their own.
     results
         Run folder whose scores are stored, too; pictures of these scores are as old as they are.
-    needs
-        A file that is not shipped; without it, the stored output stays.
     is_quick
         Whether a few seconds are enough.
     """
@@ -71,7 +67,6 @@ class Session:
     commands: tuple[str, ...]
     run: Callable[[Session, Path], list[str]] | None = None
     results: str = ""
-    needs: Path | None = None
     is_quick: bool = False
 
     @property
@@ -83,11 +78,6 @@ class Session:
     def stored(self) -> str:
         """The stored output; empty if there is none."""
         return self.file.read_text(encoding="utf-8") if self.file.exists() else ""
-
-    @property
-    def is_possible(self) -> bool:
-        """Whether its input is there."""
-        return self.needs is None or self.needs.exists()
 
     def printed(self, folder: Path) -> str:
         """Run the commands in a new folder and return what they print, without times and sizes of files."""

@@ -9,7 +9,7 @@ import egvs
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.cli import answer
-from egvs.core.errors import collect_warnings
+from egvs.core.errors import WARNINGS_KEY, Diagnostic, collect_warnings
 from egvs.report import ranking_text, sections
 from egvs.report.reliability import by_severity, describe_reliability
 from egvs.results.plans import SensorPlan
@@ -80,6 +80,20 @@ def test_no_fact_is_lost_in_the_report_and_with_verbose(six_poles: Path, tmp_pat
     for text in (printed + error, page):
         plain = " ".join(text.replace("\u2019", "'").replace("\u00a0", " ").split())
         assert [fact for fact in facts if " ".join(fact.replace("\u2019", "'").split()) not in plain] == []
+
+
+def test_a_pole_in_a_lane_is_named_whatever_else_is_warned_of(
+    mini: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenario, out = egvs.load(mini), tmp_path / "out"
+    record = egvs.run(scenario, out)
+    answer.print_answer(out, scenario, record)
+    assert "Careful" not in capsys.readouterr().out
+    best = Ranking.read(out / "scores.parquet").best[0].site
+    in_lane = Diagnostic("sites on lanes", f"sites.csv: site {best}", "(1, 2, 3) is in a lane of Mill Lane", "")
+    record.stages["check"].summary[WARNINGS_KEY] = [in_lane.to_json()]
+    answer.print_answer(out, scenario, record)
+    assert f"\nCareful: {best} stands in a lane of Mill Lane.\n" in capsys.readouterr().out
 
 
 def test_plans_in_one_go(six_poles: Path, tmp_path: Path, run_egvs) -> None:

@@ -42,8 +42,6 @@ def test_pages_quote_what_is_printed(quote: Quote) -> None:
 )
 @pytest.mark.system
 def test_program_prints_what_is_stored(session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not session.is_possible:
-        pytest.skip(f"{session.needs} is not beside the checkout")
     monkeypatch.setenv("EGVS_STORE", str(tmp_path / "store"))
     folder = tmp_path / session.name
     assert session.printed(folder) == session.stored, HINT

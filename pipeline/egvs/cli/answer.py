@@ -106,6 +106,8 @@ def _print_short(
     after = []
     if record.stages["score"].summary.get("missed") and (worst := _worst_location(folder, best)):
         after += wrap_lines(f"Worst lane: {worst}.", 1)
+    if on_road := sections.describe_poles_on_road(ranked.poles[:MIN_POLES], _check_warnings(record)):
+        after += wrap_lines(f"Careful: {join_names(on_road)}.", 1)
     plans = record.traffic_summary.get("signals", ())
     if assumed := sections.main_assumptions(sections.assumptions(scenario, plans)):
         after += wrap_lines(assumed, 1)

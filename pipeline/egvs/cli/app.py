@@ -603,8 +603,8 @@ def new(
             "--from",
             "--osm",
             metavar="FILE",
-            help="A map, or a folder of maps: roads (OpenStreetMap, SUMO, OpenDRIVE, Lanelet2), and what stands beside"
-            " them. Several files: --from A B C.",
+            help="A map, or a folder of maps: roads (OpenStreetMap, SUMO, .sumocfg, OpenDRIVE, Lanelet2), and what"
+            " stands beside them. Several files: --from A B C.",
         ),
     ] = None,
     at: Annotated[

@@ -81,6 +81,7 @@ from egvs.creation.scenario_files import (
     reachable_area,
 )
 from egvs.creation.static_objects import MapSummary, ReadMap, StaticObjects, SurfaceModel
+from egvs.creation.sumo_demand import SumoDemand, split_demand
 from egvs.creation.terrain import ground_heights, ground_reference
 from egvs.creation.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.creation.terrain.relief import Relief, ground_surface
@@ -324,6 +325,17 @@ class NewScenarioOptions:
                 "Choose a distance that includes the junction and its approaches.",
             )
 
+    def check_without_demand(self) -> None:
+        """Raise an InputError when an option contradicts the demand of SUMO files."""
+        options = {
+            "--counts": self.counts, "--tracks": self.tracks, "--like": self.like, "--surroundings": self.surroundings_m
+        }  # fmt: skip
+        for option, value in options.items():
+            if value:
+                raise InputError(
+                    option, "cannot be combined with SUMO's demand, which is used as it is", "Leave it out."
+                )
+
 
 @dataclass
 class _Draft:
@@ -353,6 +365,8 @@ class _Draft:
         The region of interest, its relief, its zones, and the locations for poles.
     plan, traffic, signal
         What the recordings give to the scenario, its vehicles, and the signal of the junction if its plan is assumed.
+    demand
+        The user's SUMO demand.
     notes
         What to know before trusting the scenario.
     """
@@ -385,6 +399,7 @@ class _Draft:
     plan: RecordingPlan = field(init=False)
     traffic: ScenarioTraffic = field(init=False)
     signal: Signal | None = None
+    demand: SumoDemand | None = None
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -411,7 +426,8 @@ def create_scenario(
     folder
         Created by this function; may exist if it is empty.
     maps
-        Files, or folders and ZIP archives of files: one road map, and any number of maps of static objects.
+        Files, or folders and ZIP archives of files: one road map, and any number of maps of static objects. A SUMO
+        configuration gives its network and its demand; route files give the demand for a SUMO network.
     at
         Latitude, longitude in degrees, or x, y in metres if the road map has no reference system: choose the junction
         there, see :func:`junctions.choose_nearby`. By default, the largest one with signals.
@@ -432,10 +448,14 @@ def create_scenario(
     """
     options = options or NewScenarioOptions()
     options.check()
-    paths = [Path(path) for path in ([maps] if isinstance(maps, str | Path) else maps)]
+    given = [Path(path) for path in ([maps] if isinstance(maps, str | Path) else maps)]
+    paths, demand = split_demand(Path(folder), given)
+    if demand is not None:
+        options.check_without_demand()
     with unpack_archives([*paths, *options.surface]) as unpacked:
         map_paths, surface = unpacked.paths[: len(paths)], unpacked.paths[len(paths) :]
         draft = _open_files(Path(folder), map_paths, surface, at, options)
+        draft.demand = demand
         _read_roads_and_recordings(draft)
         _choose_surroundings(draft)
         _read_maps(draft)
@@ -646,6 +666,8 @@ def _find_assumed_signal(draft: _Draft) -> Signal | None:
 def _choose_vehicles(draft: _Draft) -> ScenarioTraffic:
     """Return recorded vehicles, or else the user's counts, or else assumed ones."""
     options, streets = draft.options, draft.roads.streets
+    if draft.demand is not None:
+        return draft.demand
     if draft.plan.traffic is not None:
         return draft.plan.traffic
     if draft.plan.is_finished:
@@ -984,6 +1006,8 @@ def _scenario_toml(draft: _Draft, statics: TomlTable) -> str:
         "junction_blocker_s": JUNCTION_BLOCKER_S,
         "teleport_s": TELEPORT_S,
     }
+    if draft.demand is not None:
+        traffic = {key: value for key, value in traffic.items() if key not in ("junction_blocker_s", "teleport_s")}
     traffic = ({} if draft.plan.is_finished else traffic) | dict(draft.plan.keys)
     tables = {
         "roi": (roi_comment, roi | scenario_files.voxel_keys()),
@@ -1024,7 +1048,8 @@ def _origin_comments(attributions: Sequence[str]) -> list[str]:
 def _assumptions(draft: _Draft) -> list[str]:
     """Return what the map does not tell, for the key ``assumed``."""
     assumed = list(draft.traffic.assumptions)
-    if draft.junction.signalised and not draft.plan.is_finished and not draft.plan.signal_notes:
+    is_given = draft.demand is not None or draft.plan.is_finished or bool(draft.plan.signal_notes)
+    if draft.junction.signalised and not is_given:
         assumed.append(ASSUMED_PLANS)
     assumed += [*draft.plan.assumptions, *assumed_sizes(draft.objects.counts)]
     kinds = {solid.kind for solid in draft.objects.solids} | {mesh.kind for mesh in draft.objects.meshes}
