@@ -8,11 +8,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # Every process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-<<<<<<< HEAD
-.PHONY: run environment test test-slow test-nightly without test-train test-lowest test-portable unit check lint wheel project-files image image-test bench bench-history bench-peers scaling numerics pictures schema reference docs notebooks fuzz clean
-=======
-.PHONY: run environment test test-slow test-nightly without test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics docs-figures schema reference docs notebooks fuzz clean
->>>>>>> main
+.PHONY: run environment test test-slow test-nightly without test-train test-lowest test-portable unit check lint wheel project-files image image-test bench bench-history bench-peers scaling numerics docs-figures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
