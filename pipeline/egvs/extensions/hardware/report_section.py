@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
 from egvs.extensions.hardware.files import ACCEPTANCE, FILES, SENSOR_DESIGN, SHEETS, design_digest
-from egvs.extensions.hardware.installation.sheet import describe_side_tilt
 from egvs.report.extension_sections import SectionWarning
 from egvs.results.labels import SCORE_LABELS
 from egvs.results.ranking import RankedSite
@@ -142,6 +141,8 @@ def _is_at(recorded: Mapping[str, float], pose: Pose | None) -> bool:
 
 
 def _installation_row(name: str, values: Mapping[str, Any]) -> InstallationRow:
+    from egvs.extensions.hardware.installation.sheet import describe_side_tilt
+
     pose = values["pose"]
     tilt = "level"
     if pose["pitch_deg"]:
