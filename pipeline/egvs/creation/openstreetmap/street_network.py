@@ -296,7 +296,7 @@ def drop_far_streets(extract: OsmExtract, middle: tuple[float, float], distance_
         positions = [extract.nodes[node] for node in way.nodes if node in extract.nodes]
         if not positions:
             return True
-        lats, lons = zip(*positions, strict=True)
+        lats, lons = [lat for lat, _ in positions], [lon for _, lon in positions]
         return (
             min(lats) <= lat_deg + north_deg
             and max(lats) >= lat_deg - north_deg
