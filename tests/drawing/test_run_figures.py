@@ -65,8 +65,8 @@ def test_lists_the_worst_locations_first_and_none_with_few_vehicles() -> None:
     assert figures.blindspot_note(blindspots) == "Share of vehicles found on each approach: Mill Lane (west) 63 %."
     assert blindspots.in_words() == (
         "Of all lanes, turns and crossings, p1 finds the smallest shares of vehicles on: "
-        "Mill Lane (west), left-turn lane (41 ± 8 % of 12 vehicles); "
-        "Mill Lane (west), left turn in the junction (50 ± 5 % of 11 vehicles)"
+        "Mill Lane (west), left-turn lane (41 ± 8 % of 12 vehicles found); "
+        "Mill Lane (west), left turn in the junction (50 ± 5 % of 11 vehicles found)"
     )
 
 

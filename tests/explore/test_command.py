@@ -62,7 +62,7 @@ def test_says_what_simulated_flows_are_compared_with(
     record = StageRecord("", {}, {}, {"frames": 10, "counts": [{"geh": 0.21}]}, ResourceUsage(seconds=1.0, peak_mb=1.0))
 
     def open_session(*_: object, listener: StageListener, **__: object) -> None:
-        listener("traffic", "skipped", record)
+        listener("traffic", "done", record)
         raise InputError("here", "the session would begin")
 
     monkeypatch.setattr(settings, "open_session", open_session)

@@ -251,13 +251,15 @@ def test_rejects_unknown_detectors_and_those_without_effect(mini: Path, override
 
 def test_option_sets_the_key(mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     sets = ("--set", RANKED)
-    code, printed, told = run_egvs("run", mini, "--out", tmp_path / "option", "--detector", "cluster", *sets)
+    code, printed, told = run_egvs(
+        "run", mini, "--out", tmp_path / "option", "--detector", "cluster", *sets, "--verbose"
+    )
     assert code == 0, told
     assert "; the score is that of the detector cluster." in " ".join(printed.split())
     by_key = run(mini, tmp_path / "key", "score.detector='cluster'")
     by_option = {row["site"]: row for row in read_scores(tmp_path / "option" / "scores.parquet").to_pylist()}
     assert by_option == by_key
-    code, printed, told = run_egvs("run", mini, "--out", tmp_path / "all", *sets)
+    code, printed, told = run_egvs("run", mini, "--out", tmp_path / "all", *sets, "--verbose")
     assert code == 0, told
     expected = (
         "± contains the error of a finite simulation, and how far the detectors (cluster, pointpillars) disagree."

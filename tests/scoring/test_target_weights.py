@@ -113,7 +113,9 @@ def test_a_weight_of_one_for_all_changes_nothing(mini: Path, tmp_path: Path) -> 
 
 def test_weights_are_reported(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     weights = ("--set", WEST, "--set", "score.weights.kinds.passenger=2")
-    code, printed, told = run_egvs("run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well", *weights)
+    code, printed, told = run_egvs(
+        "run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well", *weights, "--verbose"
+    )
     assert code == 0, told
     assert "Vehicles are weighted: passenger 2, zone west 4." in printed
     page = (tmp_path / "report.html").read_text(encoding="utf-8")

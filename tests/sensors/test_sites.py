@@ -157,7 +157,7 @@ def test_run_ranks_candidates_and_groups_them_by_pole(mini: Path, tmp_path: Path
     (mini / "sites.csv").write_text("site,x_m,y_m\nc01,10,12\nc02,30.5,-12\n")
     expected = ["sites.heights_m=[3, 4.5]", 'sites.pitch_deg=[0, "aim"]', "sites.aim=roi", "score.standard_error=false"]
     words = [mini, "--out", tmp_path / "run", *(part for w in expected for part in ("--set", w))]
-    code, out, _ = run_egvs("run", *words)
+    code, out, _ = run_egvs("run", *words, "--verbose")
     assert code == 0
     scores = egvs.read_scores(tmp_path / "run" / "scores.parquet").to_pylist()
     assert [row["pole"] for row in scores] == ["c01"] * 4 + ["c02"] * 4

@@ -44,7 +44,7 @@ def house_without_floor(folder: Path) -> None:
 @pytest.mark.parametrize("rank_by", ["egvs", "expected_detections"])
 def test_warns_of_site_inside_house_without_floor(mini: Path, run_egvs: Any, rank_by: str) -> None:
     house_without_floor(mini)
-    code, _, printed = run_egvs("run", mini, "--out", mini / "out", "--set", f"score.rank_by={rank_by}")
+    code, _, printed = run_egvs("run", mini, "--out", mini / "out", "--set", f"score.rank_by={rank_by}", "--verbose")
     assert code == 0
     assert f"{rank_by} is 0 at pole_a (100 %)" in printed
     assert "a mesh without a floor is no closed solid" in printed

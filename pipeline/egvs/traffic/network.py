@@ -643,15 +643,21 @@ def _point(text: str) -> tuple[float, float]:
 
 def check_is_no_map(path: Path) -> None:
     """Raise an InputError for a map of a format that ``egvs new`` makes networks of."""
-    is_map = osm.is_pbf(path)
-    if not is_map:
-        try:
-            is_map = xml.read_root_tag(path) in _MAP_ROOTS
-        except InputError:
-            return  # whoever reads the network reports it
-    if is_map:
+    state = path.stat()
+    if _is_map(path, state.st_mtime_ns, state.st_size):
         hint = f"Run egvs new NAME --from {path.name}, which makes a scenario with a network of it."
         raise InputError(path, "expected a SUMO network, got a map", hint)
+
+
+@lru_cache(maxsize=8)
+def _is_map(path: Path, _modified_ns: int, _size: int) -> bool:
+    """Whether a file is OpenStreetMap, Lanelet2 or OpenDRIVE; stages name their network many times."""
+    if osm.is_pbf(path):
+        return True
+    try:
+        return xml.read_root_tag(path) in _MAP_ROOTS
+    except InputError:
+        return False  # whoever reads the network reports it
 
 
 def may_have_slopes(path: Path) -> bool:
