@@ -415,6 +415,6 @@ def test_city_gets_the_side_and_the_turns_of_the_map(tmp_path: Path) -> None:
         creation.create_city(tmp_path / "other", path, NewCityOptions(which="all", righthand=True))
     draft, ways = divided_road()
     draft.restrict("no_left_turn", ways["middle"], draft.via((0.0, -APART_M)), ways["to east"])
-    street_network._write_streets(draft.extract(), tmp_path / "turns.osm")
+    street_network._write_streets(draft.extract(), tmp_path / "turns.osm", ())
     city = creation.create_city(tmp_path / "turns", tmp_path / "turns.osm", NewCityOptions(which="all"))
     assert any(note.startswith("1 turn that the map does not permit was closed") for note in city.notes)
