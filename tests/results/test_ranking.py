@@ -117,6 +117,7 @@ def test_the_headline_names_whose_level_it_is_with_the_measured_error() -> None:
         ("k04@4.5m-10deg", {"pole": "k04", "z_m": 104.5, "pitch_deg": -10.0}, "pole k04, 4.5 m up, tilted 10° down"),
         ("Pole 7", {"z_m": 6.0, "pitch_deg": 2.5}, "Pole 7, 6 m up, tilted 2.5° up"),
         ("kerb", {"z_m": 6.0, "roll_deg": 180.0}, "pole kerb, 6 m up, level, upside down"),
+        ("kerb_high", {"pole": "kerb", "z_m": 6.0}, "pole kerb, 6 m up, level"),
     ],
 )
 def test_a_site_is_named_as_people_would(name: str, values: dict[str, Any], title: str) -> None:
@@ -124,6 +125,12 @@ def test_a_site_is_named_as_people_would(name: str, values: dict[str, Any], titl
     assert site_titles([site]) == {name: title}
     same = replace(site, site=f"{name}_b", yaw_deg=90.0)
     assert site_titles([site, same])[same.site] == f"{title} ({same.site})"
+
+
+@pytest.mark.parametrize("pole", ["c02", "c1"])
+def test_a_site_with_another_name_than_its_pole_is_called_by_it(pole: str) -> None:
+    site = replace(ranking(("c10", 1.0, 1, 0.5, 0.9)).sites[0], pole=pole, z_m=3.0)
+    assert site_titles([site]) == {"c10": "site c10, 3 m up, level"}
 
 
 def test_a_height_above_sloping_ground_is_not_made_up() -> None:

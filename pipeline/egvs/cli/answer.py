@@ -32,7 +32,7 @@ from egvs.report.extension_sections import read_sections
 from egvs.report.sensor_text import detection_level, has_losses, range_note, upper_limit_note
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
 from egvs.results.levels import NO_DETECTORS, DetectionLevel, read_levels
-from egvs.results.ranking import Pole, RankedSite, Ranking, describe_mount, site_titles
+from egvs.results.ranking import Pole, RankedSite, Ranking, describe_mount, is_named_after_pole, site_titles
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import NOTICED
 from egvs.sensors import sites
@@ -260,6 +260,11 @@ def poles_table(ranked: Ranking, by_period: PeriodRanking | None, count: int | N
     return make_table(columns, poles)
 
 
+def _describe_best(site: RankedSite, *, has_relief: bool) -> str:
+    mount = describe_mount(site, has_relief=has_relief)
+    return mount if is_named_after_pole(site) else f"{site.site}: {mount}"
+
+
 def _short_table(ranked: Ranking, by_period: PeriodRanking | None, count: int, has_relief: bool) -> Table:
     """Return the best poles with what differs most: mount, score, distance to the best one, and ranks by period."""
     best, poles = ranked.best[0], ranked.poles[:count]
@@ -273,7 +278,7 @@ def _short_table(ranked: Ranking, by_period: PeriodRanking | None, count: int, h
     columns = [
         Column[Pole]("", lambda pole: str(1 + poles.index(pole))),
         Column[Pole]("pole", lambda pole: pole.name, "left"),
-        Column[Pole]("best mount", lambda pole: describe_mount(pole.best, has_relief=has_relief), "left"),
+        Column[Pole]("best mount", lambda pole: _describe_best(pole.best, has_relief=has_relief), "left"),
     ]
     if len({site.sensor for site in ranked.sites}) > 1:
         columns.append(Column("sensor", lambda pole: pole.best.sensor, "left"))

@@ -113,7 +113,7 @@ def headline(
     top = best[0]
     title = titles.get(top.site, top.site)
     comma = "," if "," in title else ""
-    subject = f"P{title[1:]}" if title.startswith("pole ") else title
+    subject = title[0].upper() + title[1:] if title.startswith(("pole ", "site ")) else title
     if not has_traffic:
         return "No traffic in the region: the sites cannot be ranked"
     if not top.score > 0:

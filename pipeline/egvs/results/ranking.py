@@ -282,15 +282,24 @@ def describe_mount(mount: Mounted, *, has_relief: bool = False) -> str:
     return f"{height}, {tilt}"
 
 
+def is_named_after_pole(mount: Mounted) -> bool:
+    """Return whether the name of a site is that of its pole, alone or with an addition: "k04@3m+0deg", "kerb_high"."""
+    rest = mount.site.removeprefix(mount.pole)
+    return rest != mount.site and not rest[:1].isalnum()
+
+
 def site_titles(mounts: Iterable[Mounted], *, has_relief: bool = False) -> dict[str, str]:
     """Return what people call sites, by their names, e.g. "pole k04, 3 m up, level" for "k04@3m+0deg".
 
-    Sites that would have the same title have their name in it. The parameters are those of :func:`describe_mount`.
+    A site with a name of its own on the pole of another is called by it, e.g. "site c10, 3 m up, level". Sites that
+    would have the same title have their name in it. The parameters are those of :func:`describe_mount`.
     """
     titles = {}
     for mount in mounts:
-        noun = "" if "pole" in mount.pole.lower() else "pole "
-        titles[mount.site] = f"{noun}{mount.pole}, {describe_mount(mount, has_relief=has_relief)}"
+        name = mount.pole if "pole" in mount.pole.lower() else f"pole {mount.pole}"
+        if not is_named_after_pole(mount):
+            name = f"site {mount.site}"
+        titles[mount.site] = f"{name}, {describe_mount(mount, has_relief=has_relief)}"
     count = Counter(titles.values())
     return {site: title if count[title] == 1 else f"{title} ({site})" for site, title in titles.items()}
 
