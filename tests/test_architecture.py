@@ -186,6 +186,7 @@ USES = {
     "run_accuracy_study": "list(run_accuracy_study.__annotations__)[:2] == ['path', 'overrides']",
     "shipped_scenario": "shipped_scenario('demo').is_dir()",
     "verify": "verify('run') == []",
+    "write_clouds": "(write_clouds(__import__('egvs').load('mini'), 'clouds', frames=2) / 'README.md').is_file()",
     "what_if": "from egvs import load; box = '{share=0.5,boxes=[{x_m=10,y_m=30,length_m=1,width_m=1,height_m=1}]}'; "
     "what_if('mini', ['what_if.crate=' + box]).answers[0].name == 'crate'",
 }

@@ -181,6 +181,7 @@ def test_what_people_notice_of_a_plan_of_one_sensor_is_that_of_its_scan(placed: 
 
 
 @pytest.mark.slow
+@pytest.mark.system  # matplotlib, which cma imports, asks for fonts once
 def test_refined_sensors_are_scanned_where_they_are(placed: SimpleNamespace) -> None:
     limits = ["placement.refine.evaluations=20", "placement.refine.radius_m=2", "placement.refine.heights_m=[2, 5]"]
     scenario = egvs.load(placed.folder, [FOUND, "placement.count=2", "tpog.blocks=10", *limits])

@@ -224,7 +224,8 @@ def test_groups_have_a_level_each(mini: Path, tmp_path: Path, run_egvs) -> None:
     text = toml.read_text(encoding="utf-8")
     bus = '[[traffic.kinds]]\nname = "bus"\nvclass = "bus"\nlength_m = 4.5\nwidth_m = 1.8\nheight_m = 1.5\n\n'
     toml.write_text(text.replace("[[traffic.kinds]]", f"{bus}[[traffic.kinds]]", 1), encoding="utf-8")
-    code, printed, _ = run_egvs("run", mini, "--out", tmp_path, "--all", "--set", "score.rank_by=expected_detections")
+    options = ("--all", "--verbose", "--set", "score.rank_by=expected_detections")
+    code, printed, _ = run_egvs("run", mini, "--out", tmp_path, *options)
     assert code == 0
     levels = read_artefact(tmp_path / "levels.parquet", "levels")[0].to_pylist()
     for of_all, *groups in zip(*(levels[start::3] for start in range(3)), strict=True):
@@ -245,7 +246,7 @@ def test_groups_have_a_level_each(mini: Path, tmp_path: Path, run_egvs) -> None:
     # the sensor has no rated range, so no level of the corrected detectors was measured
     assert line.split()[2] == str(larger["observations"]) and line.split("  ")[-2:] == [NOT_MEASURED, noticed_text]
     page = (tmp_path / "report.html").read_text(encoding="utf-8").replace("\u00a0", " ")
-    unknown = f"{NOT_MEASURED} for detectors (cluster, pointpillars) without losses of returns; people would notice"
+    unknown = f"{NOT_MEASURED} for detectors without losses of returns; people would notice"
     assert unknown in " ".join(printed.split()) and unknown in page
     assert "TUM Traffic Intersection Dataset, Zimmer et al. 2023" in page
     assert f'<th scope="row">larger vehicles</th><td class="n">{larger["observations"]}</td>' in page

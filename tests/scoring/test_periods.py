@@ -112,7 +112,7 @@ def test_changed_weights_need_no_new_traffic(split: Path, tmp_path: Path) -> Non
 def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     code, printed, told = run_egvs("run", split, "--out", tmp_path / "out", "--verbose")
     assert code == 0
-    (night,) = (line for line in told.splitlines() if line.split()[0] == "night")
+    (night,) = (line for line in told.splitlines() if line.split()[:1] == ["night"])
     assert night.split("   ")[-1].startswith("16 frames; 2 vehicles at a time, 2 in all;")
     assert "standard errors from day: 4 blocks of 6 frames" in told
     (head,) = (line for line in printed.splitlines() if "pole  " in line)

@@ -21,6 +21,7 @@ from egvs.scenario.signal_config import SignalPhaseConfig
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.stages import check, traffic
 from egvs.traffic import directions, network, signal_descriptions, signal_plans, signals, sumo, sumo_folder
+from tests.installed import needs
 from tests.stage_runner import run_stage
 from tests.traffic.helpers import netgenerate
 
@@ -484,6 +485,7 @@ sensor = "VLP-16"
 """
 
 
+@needs("hardware")
 @pytest.mark.slow
 @pytest.mark.parametrize("plan", [
     'signals.c.phases = [{ green = { north = ["all"], south = ["all"] }, green_s = 30 }, '

@@ -149,7 +149,7 @@ def square_around(at: tuple[float, float], surroundings_m: float | None = None) 
     latitude_deg, longitude_deg = at
     if not (abs(latitude_deg) <= MAX_LATITUDE_DEG and abs(longitude_deg) <= 180):
         problem = (
-            f"expected LAT,LON within {MAX_LATITUDE_DEG:g} and 180 degrees, got {latitude_deg:g},{longitude_deg:g}"
+            f"expected LAT,LON within {MAX_LATITUDE_DEG:g} and 180 degrees, got {latitude_deg!r},{longitude_deg!r}"
         )
         hint = "Use coordinates such as 50.8704,9.7080."
         if abs(longitude_deg) <= MAX_LATITUDE_DEG and abs(latitude_deg) <= 180:
