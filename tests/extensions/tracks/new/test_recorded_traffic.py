@@ -194,7 +194,7 @@ def test_k733_uses_the_tracks(k733: Path) -> None:
     """The published recording has 74 tracks in 157 s; its junction is at 49.0053 N, 8.4374 E."""
     scenario = egvs.load(k733)
     assert scenario.traffic.tracks == ("tracks/vehicle_tracks_000.csv.gz",)
-    assert scenario.assumed == ("positions of the poles",)
+    assert scenario.assumed == ("surroundings (no building or tree is known)", "positions of the poles")
     assert (k733 / "tracks" / "meta_data.csv").is_file()
 
 
