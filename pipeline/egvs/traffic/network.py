@@ -652,10 +652,8 @@ def check_is_no_map(path: Path) -> None:
 @lru_cache(maxsize=8)
 def _is_map(path: Path, _modified_ns: int, _size: int) -> bool:
     """Whether a file is OpenStreetMap, Lanelet2 or OpenDRIVE; stages name their network many times."""
-    if osm.is_pbf(path):
-        return True
     try:
-        return xml.read_root_tag(path) in _MAP_ROOTS
+        return osm.is_pbf(path) or xml.read_root_tag(path) in _MAP_ROOTS
     except InputError:
         return False  # whoever reads the network reports it
 
