@@ -76,7 +76,7 @@ class Session:
 
     @property
     def stored(self) -> str:
-        """The stored output; empty if there is none."""
+        """The stored output; empty before the first run."""
         return self.file.read_text(encoding="utf-8") if self.file.exists() else ""
 
     def printed(self, folder: Path) -> str:

@@ -132,8 +132,7 @@ def test_signal_of_a_crossing_stays_where_people_walk(tmp_path: Path, walk: bool
         check_program(signal)
 
 
-def test_signal_beside_a_minor_street_is_none_of_its_junction(tmp_path: Path) -> None:
-    """A crossing on one of three approaches leaves the junction uncontrolled."""
+def test_signal_on_one_of_three_approaches_leaves_junction_uncontrolled(tmp_path: Path) -> None:
     assert not read_signals(tmp_path, build(tmp_path, {17: CROSSWALK}, two_way=True))
 
 

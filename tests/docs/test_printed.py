@@ -85,7 +85,7 @@ PRINTED = (
         ("    1  kerb_NW    3  73.8 %\n    ...\n    2  kerb_NE    3  72.8 %\n", ["2 kerb_NE 3 72.8 %"]),
     ],
 )
-def test_stale_parts_are_found(text: str, stale: list[str], tmp_path: Path) -> None:
+def test_lists_stale_parts_of_a_quote(text: str, stale: list[str], tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(f"Before.\n\n<!-- printed: demo -->\n{text}\n\nAfter, 12 of them.\n", encoding="utf-8")
     (quote,) = quotes_of(page)

@@ -407,7 +407,7 @@ def test_u_turn_has_one_printed_name(word):
     assert [row["movements"] for row in plan["rows"]] == [["U-turn"]]
 
 
-def test_approach_is_found_by_another_street_that_leads_to_it():
+def test_approach_is_known_by_the_name_of_another_street_to_it():
     links = [
         signals.Link(0, "High Street (west)", "straight", "a", "High Street", np.array([1.0, 0.0]), side="west",
                      aliases=("Back Lane",)),

@@ -161,7 +161,7 @@ class MovingPlan:
 
     @cached_property
     def best_next(self) -> tuple[str, float] | None:
-        """The candidate with the largest gain that the rules allow, and its gain; None if there is none."""
+        """The candidate with the largest gain that the rules allow, and its gain; None if they allow no more."""
         problem = self.poses.placement_problem
         allowed = self._rules.allowed_additions(self.poses.plan)
         gains = {name: self.gain(name) for name, is_allowed in zip(problem.names, allowed, strict=True) if is_allowed}

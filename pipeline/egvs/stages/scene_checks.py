@@ -347,7 +347,7 @@ class PoleSurroundings:
         Distance to the edge of the carriageway; NaN if there is no network.
     wall_m
         Distance to the nearest surface that is not ground, tree or another pole, at most
-        :data:`MAX_WALL_M`; NaN if there is none.
+        :data:`MAX_WALL_M`; NaN if it is farther away.
     """
 
     pole: str
