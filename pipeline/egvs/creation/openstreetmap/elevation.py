@@ -18,7 +18,8 @@ from itertools import pairwise
 import numpy as np
 
 from egvs.core.wording import by_number, number_of
-from egvs.creation.openstreetmap.street_network import EARTH_M, is_road
+from egvs.creation.openstreetmap import distance_m
+from egvs.creation.openstreetmap.street_network import is_road
 from egvs.formats.osm import OsmExtract, parse_number
 
 ELEVATION_FLAGS = ("--osm.elevation", "--geometry.max-grade.fix", "false")
@@ -124,16 +125,9 @@ def _along(extract: OsmExtract, road: tuple[int, ...], heights: Mapping[int, flo
         return
     along_m = [0.0]
     for start, end in pairwise(road):
-        along_m.append(along_m[-1] + _distance_m(extract.nodes[start], extract.nodes[end]))
+        along_m.append(along_m[-1] + distance_m(extract.nodes[start], extract.nodes[end]))
     known_m = [along_m[index] for index in known]
     known_heights = [heights[road[index]] for index in known]
     for index, node in enumerate(road):
         if node not in heights:
             yield node, float(np.interp(along_m[index], known_m, known_heights))
-
-
-def _distance_m(one: tuple[float, float], other: tuple[float, float]) -> float:
-    """Return the distance of two positions (latitude, longitude), as on a small part of a sphere."""
-    north = math.radians(other[0] - one[0])
-    east = math.radians(other[1] - one[1]) * math.cos(math.radians(one[0]))
-    return EARTH_M * math.hypot(north, east)

@@ -33,7 +33,7 @@ from egvs.core.errors import InputError
 from egvs.core.files import atomic_write, temporary_folder
 from egvs.core.limits import DOWNLOAD, DOWNLOAD_TIME
 from egvs.creation import junctions
-from egvs.creation.openstreetmap import ATTRIBUTION
+from egvs.creation.openstreetmap import ATTRIBUTION, EARTH_M
 from egvs.creation.openstreetmap import reader as openstreetmap
 from egvs.creation.scenario_files import SENSOR
 from egvs.formats import osm, xml
@@ -52,7 +52,6 @@ MAX_RADIUS_M = 5000.0
 """A square of 10 km is the most that a public server should be asked for."""
 
 _MARGIN_M = 50.0
-_EARTH_RADIUS_M = 6_371_008.8
 _SERVER_TIME_S, _SERVER_MEMORY_BYTES = 60, 268_435_456
 _CHUNK_BYTES = 1 << 16
 _HEAD_BYTES = 4096
@@ -162,7 +161,7 @@ def square_around(at: tuple[float, float], surroundings_m: float | None = None) 
         raise InputError("--surroundings", problem, "Download a larger extract yourself and give it with --from.")
     solids_m = junctions.ROI_MAX_M / math.sqrt(2) + junctions.BEYOND_ROI_M + CATALOGUE[SENSOR].range_m
     half_m = junctions.MAX_FROM_POINT_M + max(streets_m, solids_m) + _MARGIN_M
-    north_deg = math.degrees(half_m / _EARTH_RADIUS_M)
+    north_deg = math.degrees(half_m / EARTH_M)
     east_deg = north_deg / math.cos(math.radians(latitude_deg))
     if abs(longitude_deg) + east_deg > 180:
         hint = "Download an extract yourself and give it with --from."

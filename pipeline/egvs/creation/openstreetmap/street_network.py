@@ -28,7 +28,7 @@ from egvs.core.errors import InputError, RunError
 from egvs.core.grid import XY
 from egvs.creation import junctions
 from egvs.creation.junctions import StreetJunction, Streets
-from egvs.creation.openstreetmap import ATTRIBUTION, street_turns
+from egvs.creation.openstreetmap import ATTRIBUTION, EARTH_M, street_turns
 from egvs.creation.openstreetmap.restrictions import is_restriction, restrictions_of_pieces
 from egvs.creation.openstreetmap.street_signals import number_crossings, signals_at_stop_lines, without_signal
 from egvs.creation.plain_network import NETWORK_FILE
@@ -65,8 +65,6 @@ SIDEWALK_FLAGS = ("--sidewalks.guess", "--sidewalks.guess.max-speed", "28", "--c
 The limit is 28 m/s instead of 13.89 m/s: netconvert assumes up to that speed on a main street without ``maxspeed``, but
 more on a motorway.
 """
-
-EARTH_M = 6371008.8
 
 PATH_HIGHWAYS = {
     "footway", "path", "cycleway", "steps", "pedestrian", "bridleway", "corridor", "platform", "elevator", "proposed",

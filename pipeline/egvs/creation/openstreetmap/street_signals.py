@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterator, Mapping
 from itertools import combinations, pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
+from egvs.creation.openstreetmap import distance_m
 from egvs.formats.osm import OsmExtract, Tags
 
 if TYPE_CHECKING:
@@ -32,7 +33,6 @@ _MIN_ARMS = 3
 _CONTROLLED = re.compile(
     r'(?P<before><connection from="(?P<edge>[^"]*)"[^>]* tl="(?P<signal>[^"]*)" )linkIndex="(?P<index>\d+)"'
 )
-_EARTH_M = 6371008.8
 
 
 def is_signal(tags: Tags) -> bool:
@@ -56,7 +56,7 @@ def signals_at_stop_lines(extract: OsmExtract, roads: Collection[int], *, walk: 
     for way in roads:
         nodes = [node for node in extract.ways[way].nodes if node in extract.nodes]
         for node, other in pairwise(nodes):
-            length_m = _distance_m(extract, node, other)
+            length_m = distance_m(extract.nodes[node], extract.nodes[other])
             neighbours.setdefault(node, {})[other] = neighbours.setdefault(other, {})[node] = length_m
     signals = [node for node in neighbours if is_signal(extract.node_tags.get(node, {}))]
     beside = {node: _junctions_near(node, neighbours) for node in signals if len(neighbours[node]) < _MIN_ARMS}
@@ -87,12 +87,6 @@ def _junctions_near(start: int, neighbours: Mapping[int, Mapping[int, float]]) -
             if after not in (before, start) and length_m + step_m <= STOP_LINE_M:
                 queue.append((after, node, length_m + step_m))
     return found
-
-
-def _distance_m(extract: OsmExtract, node: int, other: int) -> float:
-    (lat_deg, lon_deg), (other_lat_deg, other_lon_deg) = extract.nodes[node], extract.nodes[other]
-    east_deg = (other_lon_deg - lon_deg) * math.cos(math.radians(lat_deg))
-    return _EARTH_M * math.radians(math.hypot(east_deg, other_lat_deg - lat_deg))
 
 
 class MapSignals(NamedTuple):

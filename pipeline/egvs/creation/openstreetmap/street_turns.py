@@ -22,6 +22,7 @@ from xml.etree.ElementTree import Element
 
 from egvs.core.grid import XY
 from egvs.core.wording import by_number, list_first, number_of
+from egvs.creation.openstreetmap import EARTH_M
 from egvs.creation.openstreetmap.restrictions import (
     Progress,
     Restriction,
@@ -54,7 +55,6 @@ _INSIDE_M = 200.0
 
 _HEADING_M = 15.0
 _STRAIGHT_DEG = 30.0
-_EARTH_M = 6371008.8
 
 _INTEGER = re.compile(r"-?\d+")
 _ORIGIN_PARAMS = re.compile(r'\n *<param key="orig(?:Id|EdgeIds|From|To)" value="[^"]*"/>')
@@ -347,7 +347,7 @@ class StreetGraph:
     def _xy(self, node: int) -> XY:
         lat_deg, lon_deg = self._extract.nodes[node]
         shrink = math.cos(math.radians(self._extract.bounds.south_deg))
-        return _EARTH_M * math.radians(lon_deg) * shrink, _EARTH_M * math.radians(lat_deg)
+        return EARTH_M * math.radians(lon_deg) * shrink, EARTH_M * math.radians(lat_deg)
 
     def length_m(self, steps: Sequence[Step]) -> float:
         """Return the length of some pieces of ways."""
