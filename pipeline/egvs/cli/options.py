@@ -32,7 +32,9 @@ def _check_folder_name(folder: Path | None) -> Path | None:
     """Raise an InputError for the name of a page in place of a run folder."""
     if folder is not None and folder.suffix.lower() in (".html", ".htm"):
         problem = f"expected the folder of the run, got {folder}"
-        raise InputError("--out", problem, f"For one page with the 3D view, use egvs explore --to {folder}.")
+        raise InputError(
+            "--out", problem, f"For one page with the 3D view, use egvs explore --to {shlex.quote(str(folder))}."
+        )
     return folder
 
 
