@@ -221,6 +221,8 @@ def _read_growing_csv(path: Path, element: str, has_ended: Callable[[], bool]) -
                 time.sleep(_WAIT_S)
                 continue
             lines, line_end, content = content.rpartition(b"\n")
+            if not line_end:
+                continue
             if layout is None:
                 header, _, lines = lines.partition(b"\n")
                 if not header:
