@@ -178,6 +178,11 @@ def test_run_has_same_bytes_record_and_states_as_in_turn(
     assert set(DATA) < one.keys()
 
 
+def test_stages_that_work_ahead_are_named() -> None:
+    declared = {name for name in STAGE_NAMES if stage_registry.stage(name).ahead is not None}
+    assert declared == stage_registry.AHEAD_STAGES
+
+
 def note_blocks(self: tpog.BlocksAhead, blocks: Callable[..., Any], calls: list[tpog.BlocksAhead]) -> Any:
     """Note that blocks were counted while SUMO simulated, and return them."""
     calls.append(self)

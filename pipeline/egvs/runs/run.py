@@ -3,9 +3,9 @@
 :func:`run` brings every stage up to date. A stage is skipped when its key (settings by value, files by hash, source of
 the program) is that of the last run and its artefacts are unchanged; otherwise it is restored from the store, or runs
 and its artefacts are saved in the store. Stages take turns; only SUMO simulates in the background from the beginning
-(:mod:`egvs.runs.background`). ``run.json`` is written after each stage that made something, with that stage and those
-before it: an interrupted run continues from there, and no record names artefacts of another scenario. A run that is
-rejected before any stage ran leaves the folder as it was.
+(:mod:`egvs.runs.background`), and its frames are written and counted as they come. ``run.json`` is written after each
+stage that made something, with that stage and those before it: an interrupted run continues from there, and no record
+names artefacts of another scenario. A run that is rejected before any stage ran leaves the folder as it was.
 
 User files are not overwritten: no input lies where a run writes, and nothing is written through a link.
 """
@@ -374,7 +374,7 @@ class _Run:
     def _begin_ahead(self, stages: Iterable[str], stack: ExitStack) -> dict[str, WorkAhead]:
         """Begin the work of some stages that goes on while SUMO simulates; it ends with ``stack``."""
         ahead = {}
-        for name in stages:
+        for name in stage_registry.AHEAD_STAGES & set(stages):
             begin = stage_registry.stage(name).ahead
             if begin is not None and (work := stack.enter_context(begin(self.context))) is not None:
                 ahead[name] = work

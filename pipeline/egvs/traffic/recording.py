@@ -615,6 +615,7 @@ def simulate(
     check_complete(prepared)
     if region_watch is not None:
         region_watch.finish()
+    progress("frames simulated", timing.frames, timing.frames)
     peak_mb = round(max(peaks_mb), 1) if peaks_mb else None
     return round(perf_counter() - start, 3), peak_mb
 
