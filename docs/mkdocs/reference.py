@@ -198,11 +198,16 @@ def _table(model: dict[str, Any], models: dict[str, Any], prefix: str, heading: 
 
 def _rows(model: dict[str, Any]) -> list[str]:
     """The keys of one TOML table that hold a value, as a Markdown table."""
-    values = {key: field for key, field in model.get("properties", {}).items() if not _nested_models(field)}
+    values = {key: field for key, field in model.get("properties", {}).items() if _has_value(field)}
     if not values:
         return []
     rows = [_row(key, field, is_required=key in model.get("required", [])) for key, field in values.items()]
     return ["| key | type | default | meaning |", "|---|---|---|---|", *rows, ""]
+
+
+def _has_value(field: dict[str, Any]) -> bool:
+    """Whether a key may hold a value; a list of tables may be the name of a file with them instead."""
+    return not _nested_models(field) or "string" in field.get("type", ())
 
 
 def _nested_models(field: dict[str, Any]) -> list[str]:
@@ -231,6 +236,8 @@ def _type(field: dict[str, Any]) -> str:
         return f"`{json.dumps(field['const'])}`"
 
     kind = field.get("type", "")
+    if isinstance(kind, list):
+        return "text, or tables"
     if kind == "array":
         if "prefixItems" in field:
             items = [_type(item) for item in field["prefixItems"]]
@@ -255,8 +262,8 @@ def _has_typed_values(field: dict[str, Any]) -> bool:
 
 def _cell(text: str) -> str:
     """Text for a table cell; reStructuredText roles and literals become code."""
-    code = re.sub(r"(?::\w+:)?(`+)~?([^`]+)\1", r"`\2`", text)
-    return code.replace("|", "\\|").replace("\n", " ").replace("<", "&lt;")
+    code = re.sub(r"(?::\w+:)?(`+)~?([^`]+)\1", r"`\2`", text).replace("|", "\\|").replace("\n", " ")
+    return re.sub(r"(`[^`]*`)|<", lambda found: found[1] or "&lt;", code)
 
 
 def _title(heading: str) -> str:

@@ -420,6 +420,8 @@ def test_lists_junctions_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.
     ]  # fmt: skip
     assert not list(tmp_path.iterdir())
     assert run_egvs("new", "--list", "--from", SMALL, "--at", "52.0,10.0")[0] == 2
+    for option in ("--track-crs", "--track-columns", "--pedestrian-tracks", "--overpass"):
+        assert f"{option}: has no effect with --list" in run_egvs("new", "--list", "--from", SMALL, option, "any")[2]
     assert "FOLDER: no folder is given" in run_egvs("new", "--from", SMALL)[2]
     assert "no map is given" in run_egvs("new", "--list")[2]
 

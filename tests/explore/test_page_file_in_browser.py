@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.accessibility import violations
 from tests.conftest import write_mini
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
@@ -49,11 +50,6 @@ def count_shades(picture: np.ndarray, colour: np.ndarray) -> int:
     return int(((shade >= 0.5) & (differences <= 0.02)).sum())
 
 
-UNNAMED = """() => [...document.querySelectorAll("button, input")]
-    .filter(e => !e.ariaLabel && !e.labels.length && !e.textContent.trim()).map(e => e.outerHTML.slice(0, 200))"""
-"""Controls without a name for screen readers."""
-
-
 def test_opens_from_disk_without_network(tmp_path: Path) -> None:
     from playwright.sync_api import sync_playwright
 
@@ -75,7 +71,7 @@ def test_opens_from_disk_without_network(tmp_path: Path) -> None:
         tab.wait_for_function(f"({VISIBLE})().join() === '/layers/blindspots'")
         assert tab.locator("#egvs").get_attribute("data-theme") == "dark"
         assert tab.locator("main, [role=main]").count() == tab.locator("h1").count() == 1
-        assert tab.evaluate(UNNAMED) == []
+        assert violations(tab) == []
         tab.get_by_label("entropy seen").check()
         tab.wait_for_function(f"({VISIBLE})().join() === '/layers/seen'")
         tab.get_by_label("none").check()

@@ -14,6 +14,7 @@ import pytest
 
 from egvs.cli.commands import GROUP
 from egvs.core import plugins
+from tests.accessibility import violations
 from tests.conftest import write_mini
 from tests.installed import needs
 from tests.processes import run_egvs
@@ -106,6 +107,19 @@ def test_the_first_screen_is_the_answer_and_a_map(report: Path, browser: Any, wi
     assert answer["y"] + answer["height"] <= height
     assert answer["width"] > 0.8 * min(width, 640)
     assert page.locator("h1").bounding_box()["y"] < answer["y"] + answer["height"]
+    page.close()
+
+
+def test_page_violates_no_rule_of_accessibility(page: Any) -> None:
+    assert violations(page) == []
+    page.evaluate("document.querySelectorAll('details').forEach(each => each.open = true)")
+    assert violations(page) == []
+
+
+def test_rules_of_accessibility_find_a_picture_without_text(browser: Any) -> None:
+    page = browser.new_page()
+    page.set_content('<html lang="en"><title>t</title><main><h1>A picture</h1><img src="data:,"></main></html>')
+    assert [rule.partition(":")[0] for rule in violations(page)] == ["image-alt"]
     page.close()
 
 

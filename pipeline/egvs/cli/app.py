@@ -763,7 +763,8 @@ def new(
         others = {
             "--at": at, "--download": download, "--surroundings": surroundings, "--traffic": traffic, "--run": run_,
             "--vehicles-per-hour": vehicles_per_hour, "--counts": counts, "--poles": poles, "--tracks": tracks,
-            "--like": like, "--signals": signals, "--align": align, "--surface": surface,
+            "--like": like, "--signals": signals, "--align": align, "--surface": surface, "--overpass": overpass_url,
+            "--pedestrian-tracks": pedestrian_tracks, "--track-columns": track_columns, "--track-crs": track_crs,
         }  # fmt: skip
         for option in filter(others.get, others):
             raise InputError(option, "has no effect with --list", "Remove one of them.")

@@ -25,7 +25,7 @@ def what_if(
     set_: Set = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="Evaluate only the table [what_if.NAME] (repeatable); all by default."),
+        typer.Option(metavar="NAME", help="Evaluate only the table \\[what_if.NAME] (repeatable); all by default."),
     ] = None,
 ) -> None:
     """What if a lorry parks there? Does the best site change with solids that are there for a share of the time?"""

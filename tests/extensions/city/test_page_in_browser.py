@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from egvs.extensions.city import page
+from tests.accessibility import violations
 from tests.extensions.city.test_page import make_city, make_plan, make_result
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -35,5 +36,6 @@ def test_cells_of_the_tables_do_not_overlap(tmp_path: Path, width: int) -> None:
         opened = browser.new_page(viewport={"width": width, "height": 900})
         opened.goto((tmp_path / "city.html").as_uri())
         assert opened.evaluate(CUT_CELLS) == []
+        assert violations(opened) == []
         assert opened.evaluate("document.documentElement.scrollWidth - innerWidth") == 0
         browser.close()

@@ -54,7 +54,9 @@ def fit(
             " with .gz), an array per sweep (.npz), or a recording (.bag, .mcap, .db3, .pcap).",
         ),
     ],
-    name: Annotated[str, typer.Option(metavar="NAME", help="Required: name of the sensor, as in [sensors.NAME].")] = "",
+    name: Annotated[
+        str, typer.Option(metavar="NAME", help="Required: name of the sensor, as in \\[sensors.NAME].")
+    ] = "",
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; sensors/NAME by default.")
     ] = None,

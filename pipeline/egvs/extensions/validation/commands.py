@@ -26,7 +26,8 @@ _FRAMES_HELP = "Number of frames of held-out traffic."
 Spacing = Annotated[
     float | None,
     typer.Option(
-        metavar="SECONDS", help="Minimum time between two frames. [default: 7, or what the traffic allows, at least 2]"
+        metavar="SECONDS",
+        help="Minimum time between two frames. \\[default: 7, or what the traffic allows, at least 2]",
     ),
 ]
 
@@ -72,7 +73,7 @@ def validate(
     ] = None,
     against: Annotated[
         list[Path] | None,
-        typer.Option(metavar="SWEEPS", help="Hold measured sweeps against the simulation: files or a folder."),
+        typer.Option(metavar="SWEEPS", help="Compare measured sweeps with the simulation: files or a folder."),
     ] = None,
     labels: Annotated[
         list[Path] | None,
@@ -155,7 +156,7 @@ def _validate_against(
     reading: _Reading,
     detector: str,
 ) -> None:
-    """Hold measured sweeps against the simulation, or without labels, against one another."""
+    """Compare measured sweeps with the simulation, or without labels, with one another."""
     from egvs.cli.console import ProgressDisplay
     from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
     from egvs.extensions.validation.measured import tables

@@ -78,7 +78,7 @@ def write_pages(
     InputError
         If the folder cannot be written.
     """
-    title = "Held against measured sweeps"
+    title = "Compared with measured sweeps"
     written = [folder / JSON_FILE, folder / PAGE_FILE]
     files.ensure_writable_folder(written[0])
     files.write_text(written[0], files.to_json_text(values, indent=1) + "\n")
