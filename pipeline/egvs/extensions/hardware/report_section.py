@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
-from egvs.extensions.hardware.files import ACCEPTANCE, FILES, SENSOR_DESIGN, SHEETS, design_digest
+from egvs.extensions.hardware.files import ACCEPTANCE, FILES, PLANNED_KEY, SENSOR_DESIGN, SHEETS, design_digest
 from egvs.report.extension_sections import SectionWarning
 from egvs.results.labels import SCORE_LABELS
 from egvs.results.ranking import RankedSite, describe_roll
@@ -97,11 +97,10 @@ class HardwareResults:
         from egvs.results.command_entries import current_entries
 
         designs = current_entries(folder / SENSOR_DESIGN.name, stages, lambda _: design_digest(scenario))
-        sheets = current_entries(folder / SHEETS.name, stages)
+        sheets = current_sheets(folder, stages) if (folder / SHEETS.name).is_file() else {}
         checks = current_entries(folder / ACCEPTANCE.name, stages)
-        if sheets or checks:
-            poses = _present_poses(folder, stages)
-            sheets, checks = _at_present_poses(sheets, poses), _at_present_poses(checks, poses)
+        if checks:
+            checks = _at_present_poses(checks, _present_poses(folder, stages)[0])
         if not (designs or sheets or checks):
             return None
         return cls(
@@ -114,15 +113,25 @@ class HardwareResults:
         )
 
 
-def _present_poses(folder: RunFolder, stages: Mapping[str, StageRecord]) -> dict[str, Pose]:
-    """Return the poses of the sites of a run; a site of its plan has the planned one."""
+def current_sheets(folder: RunFolder, stages: Mapping[str, StageRecord]) -> Entries:
+    """Return the entries of the sheets that belong to the run and to its plan."""
+    from egvs.results.command_entries import current_entries
+
+    poses, planned = _present_poses(folder, stages)
+    entries = _at_present_poses(current_entries(folder / SHEETS.name, stages), poses)
+    return {name: values for name, values in entries.items() if name in planned or not values.get(PLANNED_KEY)}
+
+
+def _present_poses(folder: RunFolder, stages: Mapping[str, StageRecord]) -> tuple[dict[str, Pose], set[str]]:
+    """Return the poses of the sites of a run, and which of them its plan has: these have the planned pose."""
     from egvs.results.plans import SensorPlan
 
     poses = {site.site: site.pose for site in RankedSite.read(folder.scores)}
     plan = SensorPlan.read(folder)
+    planned = {}
     if plan is not None and plan.belongs_to(stages):
-        poses |= {sensor.mount.name: sensor.mount.pose for sensor in plan.sensors}
-    return poses
+        planned = {sensor.site: sensor.mount.pose for sensor in plan.sensors}
+    return poses | planned, set(planned)
 
 
 def _at_present_poses(entries: Entries, poses: Mapping[str, Pose]) -> Entries:
