@@ -282,7 +282,7 @@ def test_names_plugin_that_returns_invalid_shares(mini, package, tmp_path, value
 
 MODULES = tuple(f"egvs.effects.{name}" for name in (
     "divergence", "foliage", "mount_sway", "dropout", "fog", "moving_occlusion", "rain", "range_limit", "articulated",
-    "range_noise", "surface_losses", "pedestrians_bicycles", "slope",
+    "range_noise", "surface_losses", "mixed_returns", "pedestrians_bicycles", "slope",
 ))  # fmt: skip
 
 

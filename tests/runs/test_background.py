@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent import futures
 from dataclasses import replace
-from functools import partial
+from functools import partial, partialmethod
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from egvs.runs import run, stage_keys, stage_registry
 from egvs.runs.background import run_in_background
 from egvs.runs.run_context import open_folder
 from egvs.runs.store import Store
+from egvs.stages import tpog
 from egvs.traffic import sumo
 from tests.traffic.helpers import fake_sumo
 
@@ -163,8 +164,10 @@ def test_run_has_same_bytes_record_and_states_as_in_turn(
         with monkeypatch.context() as patch:
             patch.setenv("EGVS_STORE", str(store / name))
             prepare(patch)
+            patch.setattr(tpog.BlocksAhead, "blocks", partialmethod(note_blocks, tpog.BlocksAhead.blocks, ahead := []))
             listener = partial(add_state, states[name])
             records[name] = run.run(load(), tmp_path / name, listener=listener)
+            assert len(ahead) == (1 if name == "overlapped" else 0)
     assert list(records["overlapped"].stages) == list(STAGE_NAMES)
     assert states["overlapped"] == states["in turn"]
     assert without_costs(records["overlapped"]) == without_costs(records["in turn"])
@@ -173,6 +176,17 @@ def test_run_has_same_bytes_record_and_states_as_in_turn(
     measured = {"run.json", ".digests.json", "report.html", DATED}
     assert [name for name in one if one[name] != other[name] and name not in measured] == []
     assert set(DATA) < one.keys()
+
+
+def test_stages_that_work_ahead_are_named() -> None:
+    declared = {name for name in STAGE_NAMES if stage_registry.stage(name).ahead is not None}
+    assert declared == stage_registry.AHEAD_STAGES
+
+
+def note_blocks(self: tpog.BlocksAhead, blocks: Callable[..., Any], calls: list[tpog.BlocksAhead]) -> Any:
+    """Note that blocks were counted while SUMO simulated, and return them."""
+    calls.append(self)
+    return blocks(self)
 
 
 def add_state(states: list[tuple[str, str]], stage: str, state: str, _record: StageRecord | None) -> None:
@@ -317,9 +331,9 @@ def test_stage_that_another_process_makes_is_left_to_it(tmp_path: Path, store: P
     context = open_folder(load(), tmp_path / "out")
     key = stage_keys.stage_key("traffic", context)
     shared = Store(store)
-    with shared.maker("traffic", key.key), run_in_background("traffic", key, context, Store(store)) as stage:
+    with shared.maker("traffic", key.key), run_in_background("traffic", key, context, Store(store), {}) as stage:
         assert stage is None
-    with run_in_background("traffic", None, context, Store(store)) as stage:
+    with run_in_background("traffic", None, context, Store(store), {}) as stage:
         assert stage is None
     with shared.maker("traffic", key.key, wait=False) as is_free:
         assert is_free
@@ -341,7 +355,7 @@ def test_progress_is_that_of_the_stage_whose_turn_it_is(tmp_path: Path, monkeypa
 
     monkeypatch.setattr(stage_registry, "run_stage", work)
     key = stage_keys.StageKey("0" * 64, stage_keys.StageDependencies({}, {}))
-    with run_in_background("traffic", key, context, Store(None)) as stage:
+    with run_in_background("traffic", key, context, Store(None), {}) as stage:
         assert stage is not None and first.is_set()
         wait = futures.wait
 

@@ -45,6 +45,7 @@ def test_statuses_of_effects_in_plain_scene(mini: Path) -> None:
         "surface_losses": "your choice",
         "range_noise": "your choice",
         "mount_sway": "your choice",
+        "mixed_returns": "your choice",
         "moving_occlusion": "called for",
         "divergence": "called for",
     }

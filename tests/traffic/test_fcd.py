@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, RunError
 from egvs.traffic import fcd
 from egvs.traffic.fcd import FrameWindow, group_frames
 
@@ -82,6 +82,49 @@ def test_all_formats_give_the_same_rows(tmp_path, form, zipped):
     path = tmp_path / "recorded"  # the name says nothing, the first bytes do
     path.write_bytes(gzip.compress(content) if zipped else content)
     assert read_all(path).to_pydict() == ROWS
+
+
+class GrowingFile:
+    """A file to which each look whether it has ended adds the next part."""
+
+    def __init__(self, path, content, cuts):
+        bounds = [0, *sorted(cuts), len(content)]
+        self._parts = [content[start:end] for start, end in pairwise(bounds)]
+        self._path = path
+        self.error = None
+
+    def has_ended(self):
+        if not self._parts:
+            if self.error is not None:
+                raise self.error
+            return True
+        with self._path.open("ab") as file:
+            file.write(self._parts.pop(0))
+        return False
+
+
+@given(st.lists(st.integers(0, len(CSV)), max_size=6), st.sampled_from([1, 40, 1 << 20]))
+def test_file_that_grows_has_the_rows_of_the_complete_file(tmp_path_factory, cuts, block_bytes):
+    path = tmp_path_factory.mktemp("growing") / "fcd.csv"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fcd, "_WAIT_S", 0.0)
+        patch.setattr(fcd, "_BLOCK_BYTES", block_bytes)
+        growing = GrowingFile(path, CSV.encode(), cuts)
+        tables = list(fcd.read_growing_fcd(path, "vehicle", growing.has_ended))
+    assert pa.concat_tables(tables).to_pydict() == ROWS
+
+
+def test_file_that_grows_may_have_no_vehicle(tmp_path):
+    growing = GrowingFile(tmp_path / "fcd.csv", b"\n", [])
+    assert list(fcd.read_growing_fcd(tmp_path / "fcd.csv", "vehicle", growing.has_ended)) == []
+
+
+def test_error_of_the_writer_comes_before_that_of_its_last_row(tmp_path):
+    path = tmp_path / "fcd.csv"
+    growing = GrowingFile(path, CSV.encode() + b"1.5;b;2.5", [])
+    growing.error = RunError("the disk is full")
+    with pytest.raises(RunError, match="the disk is full"):
+        list(fcd.read_growing_fcd(path, "vehicle", growing.has_ended))
 
 
 def test_columns_in_any_order_with_others_between(tmp_path):

@@ -111,7 +111,7 @@ def test_progress_reaches_the_end(town, tmp_path):
     run_stage(
         traffic, scenario(town, network="net.xml", **SMALL), tmp_path, progress=lambda *what: reported.append(what)
     )
-    assert reported[-1] == ("frames written", 240, 240)
+    assert reported[-1] == ("frames simulated", 240, 240)
 
 
 def test_last_time_is_that_of_the_last_complete_row(tmp_path):
@@ -209,8 +209,9 @@ def test_rejects_missing_frames_at_the_end(town, tmp_path, monkeypatch, hold, me
 
 
 def damage_output(monkeypatch, name, damage):
-    """Damage an output as soon as SUMO has ended."""
-    run = sumo.run_program
+    """Damage an output as soon as SUMO has ended, and read it then."""
+    run, record = sumo.run_program, recording.record_traffic
+    monkeypatch.setattr(recording, "record_traffic", lambda *rest, live, **more: record(*rest, **more))
 
     def cut(program, arguments, folder, *more):
         printed = run(program, arguments, folder, *more)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
@@ -57,23 +58,34 @@ def read_boxes(path: Path, grid: Grid, frames: IntArray | None = None) -> Iterat
         For a file that is corrupt or out of order, or an invalid box.
     """
     with parquet.open_artefact(path, "trajectories") as (file, _):
-        last_frame = -1
+        reader = BoxReader(path, grid)
         column = file.schema_arrow.get_field_index("frame")
         for group in range(file.num_row_groups):
             statistics = file.metadata.row_group(group).column(column).statistics
             if frames is not None and not _may_contain(statistics, frames):
                 continue
             table = parquet.read_row_group(file, group, path, ["frame", *PITCHED_BOX_COLUMNS])
-            frame = table.column("frame").to_numpy().astype(np.int64)
-            if not len(frame):
-                continue
-            check_frame_order(path, frame, last_frame)
-            last_frame = int(frame[-1])
-            selected = slice(None) if frames is None else np.isin(frame, frames)
-            values = np.column_stack([table.column(name).to_numpy()[selected] for name in PITCHED_BOX_COLUMNS])
-            _check_box_values(path, frame[selected], values)
-            values[:, :3] = grid.to_grid_m(values[:, :3])
-            yield FrameBoxes(frame[selected], values)
+            if table.num_rows:
+                yield reader.read(table, frames)
+
+
+class BoxReader:
+    """Reads the row groups of ``trajectories.parquet`` in their order; parameters as of :func:`read_boxes`."""
+
+    def __init__(self, path: Path, grid: Grid) -> None:
+        self._path, self._grid = path, grid
+        self._last_frame = -1
+
+    def read(self, table: pa.Table, frames: IntArray | None = None) -> FrameBoxes:
+        """Return the boxes of the next row group, which is not empty; InputError as of :func:`read_boxes`."""
+        frame = table.column("frame").to_numpy().astype(np.int64)
+        check_frame_order(self._path, frame, self._last_frame)
+        self._last_frame = int(frame[-1])
+        selected = slice(None) if frames is None else np.isin(frame, frames)
+        values = np.column_stack([table.column(name).to_numpy()[selected] for name in PITCHED_BOX_COLUMNS])
+        _check_box_values(self._path, frame[selected], values)
+        values[:, :3] = self._grid.to_grid_m(values[:, :3])
+        return FrameBoxes(frame[selected], values)
 
 
 def check_frame_order(path: Path, frame: IntArray, last_frame: int) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -73,18 +73,25 @@ _METADATA_KEY = b"egvs"
 _WRITE_OPTIONS = {"compression": "zstd", "compression_level": 3, "version": "2.6", "write_statistics": True}
 
 
+Follow = Callable[[pa.Table], None]
+"""Called with each row group of an artefact when it has been written."""
+
+
 class ArtefactWriter:
     """Writes an artefact in pieces, each a row group; :func:`artefact_writer` makes it."""
 
-    def __init__(self, file: pq.ParquetWriter, schema: pa.Schema) -> None:
+    def __init__(self, file: pq.ParquetWriter, schema: pa.Schema, follow: Follow | None = None) -> None:
         self._file = file
         self._schema = schema
+        self._follow = follow
 
     def write(self, columns: Mapping[str, Any]) -> None:
         """Append one row group; ``columns`` maps the name of every column to an array, all of one length."""
         arrays = [pa.array(columns[column.name], type=column.type) for column in self._schema]
         table = pa.Table.from_arrays(arrays, schema=self._schema)
         self._file.write_table(table, row_group_size=max(1, table.num_rows))
+        if self._follow is not None:
+            self._follow(table)
 
     def describe(self, metadata: Mapping[str, Any]) -> None:
         """Set the metadata of the artefact; may be called last, when the rows are known."""
@@ -93,7 +100,11 @@ class ArtefactWriter:
 
 @contextmanager
 def artefact_writer(
-    path: Path, artefact: str, optional: tuple[str, ...] = (), extra: Mapping[str, pa.Array] | None = None
+    path: Path,
+    artefact: str,
+    optional: tuple[str, ...] = (),
+    extra: Mapping[str, pa.Array] | None = None,
+    follow: Follow | None = None,
 ) -> Iterator[ArtefactWriter]:
     """Open an artefact to write it in pieces; the file appears under its name when the block ends well.
 
@@ -107,6 +118,8 @@ def artefact_writer(
         Optional columns of the schema that this file has.
     extra
         Columns that the schema does not name (:mod:`egvs.artefacts.extra_columns`); only their types are used here.
+    follow
+        Called with each row group that was written.
     """
     schema = arrow_schema(artefact, optional)
     for name, column in (extra or {}).items():
@@ -116,7 +129,7 @@ def artefact_writer(
         files.atomic_write(path) as partial,
         pq.ParquetWriter(partial, schema, use_dictionary=strings, **_WRITE_OPTIONS) as file,
     ):
-        yield ArtefactWriter(file, schema)
+        yield ArtefactWriter(file, schema, follow)
 
 
 def write_artefact(path: Path, artefact: str, columns: Mapping[str, Any], metadata: Mapping[str, Any]) -> None:

@@ -3,15 +3,15 @@ r"""Point clouds of a static world with traffic: vehicle meshes, first hits, int
 The empty scan of *all* beams of a sensor is cast once; a frame then costs only the beams near its vehicles.
 
 Steps for a frame: where effects weight the sub-beams of a beam, draw one of them; intersect beams with the bodies of
-all boxes, of which the nearest surface wins (:mod:`egvs.kernels.mesh_casting`); drop returns that effects lose, by
-range and by surface; add noise to the ranges. A point is where the sensor measures it: along the nominal direction of
-the beam, at the measured range.
+all boxes, of which the nearest surface wins (:mod:`egvs.kernels.mesh_casting`); where an effect asks for it, make one
+return of what the whole cone of a pulse meets; drop returns that effects lose, by range and by surface; add noise to
+the ranges. A point is where the sensor measures it: along the nominal direction of the beam, at the measured range.
 
 .. math:: p = (r + \sigma n)\, d_{sensor}, \quad n \sim N(0, 1)
 
 Frames: bodies and beams are intersected along the world's axes around the sensor, in float64; points are returned in
-the sensor's frame. Not modelled: the rotation of the sensor while vehicles move (a frame is one instant), mixed returns
-at edges, second returns.
+the sensor's frame. Not modelled: the rotation of the sensor while vehicles move (a frame is one instant), second
+returns; mixed returns at edges only with :mod:`egvs.effects.mixed_returns`.
 
 **Intensity** of a return from a diffuse surface (Lambert), with reflectivity :math:`\rho` and angle of incidence
 :math:`\theta`:
@@ -49,8 +49,8 @@ import hashlib
 import tomllib
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,7 @@ from egvs.core import files, plugins
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.effects.base import Echo, Echoes, checked_shares
+from egvs.effects.merge import Cones, Merge
 from egvs.effects.returns import ReturnProbability
 from egvs.formats import meshes
 from egvs.kernels import mesh_casting
@@ -74,6 +75,7 @@ from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Pose, Site
+from egvs.world.mesh import World
 from egvs.world.ray_casting import EmptyScan
 
 REFLECTIVITY = {"paint": 0.45, "glass": 0.10, "tyre": 0.02, "cloth": 0.30, "ground": 0.17, "leaves": 0.60, "wall": 0.24}
@@ -459,6 +461,11 @@ class CloudSimulator:
         self._bodies = bodies or vehicle_meshes(scene.scenario)
         self._return_probability = ReturnProbability.of(scene, sensor)
         self._echo_effects = scene.acting(Echo)
+        self._merge = next(iter(scene.acting(Merge)), None)
+        if self._merge is not None:
+            if (refusal := self._merge.refusal(scene)) is not None:
+                raise refusal
+            self._scanner = _cone_scanner(self._scanner, self._merge)
         self._seed = scene.scenario.seed
 
         scan = self._scanner.scan(pose, sensor).rows
@@ -469,6 +476,8 @@ class CloudSimulator:
         self._cumulated_weight: FloatArray | None = None
         if scan.weight is not None:
             self._cumulated_weight = _cumulate_weights(self._beam, scan.weight)
+        self._weight = scan.weight
+        self._static_object = _static_objects(self._scanner.opaque_world, scan) if self._merge else None
         self._static_cosine, reflectivity = _static_surfaces(self._scanner, scan, directions)
         self._intensity = reflectivity * self._static_cosine
 
@@ -503,10 +512,14 @@ class CloudSimulator:
         drawn = None
         if self._cumulated_weight is not None:
             drawn = self._draw_rows(self._cumulated_weight, rng)
-        hits = self.first_hits(frame, drawn)
-        returned = (hits.owner >= 0) | self._returned
-        rows = np.flatnonzero(returned) if drawn is None else drawn[returned[drawn]]
-        rows = self._drop_lost_returns(rows, hits, frame, rng)
+        power = None
+        if self._merge is None or drawn is None:
+            hits = self.first_hits(frame, drawn)
+            returned = (hits.owner >= 0) | self._returned
+            rows = np.flatnonzero(returned) if drawn is None else drawn[returned[drawn]]
+        else:
+            rows, hits, power = self._merge_pulses(self._merge, drawn, frame)
+        rows = self._drop_lost_returns(rows, hits, power, frame, rng)
         sigma_m: float | FloatArray = self.view.sensor.range_sigma_m
         if self._echo_effects:
             echoes = self._echoes(rows, hits, frame)
@@ -518,8 +531,9 @@ class CloudSimulator:
             is_kept = rng.random(len(rows)) < probability
             rows, sigma_m = rows[is_kept], sigma_m[is_kept]
         noise = sigma_m * rng.standard_normal(len(rows), dtype=np.float32)
+        intensity = hits.intensity if power is None else hits.intensity * power
         points = np.empty((len(rows), 4), dtype=np.float32)
-        mesh_casting.fill_returns(self._beam, rows, hits.range_m, noise, hits.intensity, self._nominal, points)
+        mesh_casting.fill_returns(self._beam, rows, hits.range_m, noise, intensity, self._nominal, points)
         return LabelledSweep(Sweep(points, self._beam[rows].astype(np.uint32)), hits.owner[rows])
 
     def first_hits(self, frame: TrafficFrame, rows: IntArray | None = None) -> FirstHits:
@@ -532,6 +546,34 @@ class CloudSimulator:
         hits = self._body_caster.cast(frame, self.view.pose.position_m, range_m, self._intensity)
         range_m[(hits.owner < 0) & ~self._returned & (range_m >= 0.0)] = np.inf
         return hits
+
+    def _merge_pulses(
+        self, effect: Merge[Any], drawn: IntArray, frame: TrafficFrame
+    ) -> tuple[IntArray, FirstHits, FloatArray]:
+        """Return the rows of the pulses' returns, hits with the ranges that are measured, and the power of each row.
+
+        A cone that meets one object only has the hit of its axis. The power is that in units of a whole cone on the
+        surface of the row, (n,).
+        """
+        assert self._weight is not None and self._static_object is not None
+        count = len(effect.cone.expand(np.eye(1, 3), self.view.sensor, self.view.pose).weight)
+        pulses = (drawn // count)[:, None] * count + np.arange(count)
+        hits = self.first_hits(frame, pulses.ravel())
+        owner, range_m = hits.owner[pulses], hits.range_m[pulses]
+        surface = np.where(owner >= 0, owner, self._static_object[pulses])
+        is_hit = np.isfinite(range_m)
+        on_one_object = is_hit.all(axis=1) & (surface == surface[:, :1]).all(axis=1)
+        at_edge = is_hit.any(axis=1) & ~on_one_object
+
+        edges = pulses[at_edge]
+        weight = self._weight[edges] / self._weight[edges].sum(axis=1, keepdims=True)
+        merged = effect.merge(Cones(range_m[at_edge], weight, hits.intensity[edges], surface[at_edge]))
+        rows = pulses[:, 0].copy()
+        rows[at_edge] = edges[np.arange(len(edges)), merged.sub_beam]
+        measured_m, power = hits.range_m.copy(), np.ones(len(hits.range_m))
+        measured_m[rows[at_edge]] = merged.range_m
+        power[rows[at_edge]] = merged.power
+        return rows[on_one_object | at_edge], replace(hits, range_m=measured_m), power
 
     def _echoes(self, rows: IntArray, hits: FirstHits, frame: TrafficFrame) -> Echoes:
         """Return the surfaces that some rows meet."""
@@ -555,7 +597,12 @@ class CloudSimulator:
         return drawn
 
     def _drop_lost_returns(
-        self, rows: IntArray, hits: FirstHits, frame: TrafficFrame, rng: np.random.Generator
+        self,
+        rows: IntArray,
+        hits: FirstHits,
+        power: FloatArray | None,
+        frame: TrafficFrame,
+        rng: np.random.Generator,
     ) -> IntArray:
         """Return the rows whose return is detected, drawn by the probability that effects give it."""
         if self._return_probability is None:
@@ -569,6 +616,8 @@ class CloudSimulator:
         glass = np.array([road_users.glass_reflectivity for road_users in classes])
         is_glass = self._bodies.surfaces[triangle[on_body]] == "glass"
         reflectivity[on_body] = np.where(is_glass, glass[owner[on_body]], body[owner[on_body]])
+        if power is not None:
+            reflectivity *= power[rows]
         of_class = np.full(len(rows), np.nan)
         of_class[on_body] = whole[owner[on_body]]
         probability = self._return_probability(hits.range_m[rows], reflectivity, of_class)
@@ -592,6 +641,22 @@ def _cumulate_weights(beam: IntArray, weight: FloatArray) -> FloatArray:
     within_beam = total - before
     within_beam[np.abs(within_beam - 1.0) < _WEIGHT_TOLERANCE] = 1.0
     return beam.astype(np.float64) + np.minimum(within_beam, 1.0)
+
+
+@lru_cache(maxsize=1)
+def _cone_scanner(scanner: Scanner, effect: Merge[Any]) -> Scanner:
+    """Return a scanner that splits each beam last into the cone of an effect: its rows follow one another."""
+    others = (other for other in scanner.scene.effects if other.NAME != effect.cone.NAME)
+    return Scanner(replace(scanner.scene, effects=(*others, effect.cone)), full_sweep=True)
+
+
+def _static_objects(world: World, scan: EmptyScan) -> IntArray:
+    """Return a number below 0 for the solid of the static world along each row, (n,); -1 where there is none."""
+    assert scan.face is not None
+    number = np.full(len(scan.face), -1, dtype=np.int64)
+    on_face = scan.face >= 0
+    number[on_face] = -2 - world.solid_of_face[scan.face[on_face]].astype(np.int64)
+    return number
 
 
 def _static_surfaces(scanner: Scanner, scan: EmptyScan, directions: FloatArray) -> tuple[FloatArray, FloatArray]:

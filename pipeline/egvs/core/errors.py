@@ -321,7 +321,9 @@ def choose_one(name: str, known: Sequence[str]) -> str:
 _MAX_NAMES = 8
 
 
-def unknown_site(where: object, name: str, known: Sequence[str], of: str = "there is") -> InputError:
+def unknown_site(
+    where: object, name: str, known: Sequence[str], of: str = "there is", noun: str = "site"
+) -> InputError:
     """Return the error for an unknown site, with the sites that exist.
 
     Parameters
@@ -334,8 +336,10 @@ def unknown_site(where: object, name: str, known: Sequence[str], of: str = "ther
         The sites.
     of
         Beginning of the sentence, e.g. "this run has".
+    noun
+        "pole or site" where both are meant; then ``known`` are poles.
     """
-    return InputError(where, f"{of} no site {name!r}", choose_one(name, known))
+    return InputError(where, f"{of} no {noun} {name!r}", choose_one(name, known))
 
 
 def _name_similarity(a: str, b: str) -> float:

@@ -8,9 +8,10 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
+from threading import Event
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -50,8 +51,18 @@ _AT_CHECKPOINT: ContextVar[Callable[[], None] | None] = ContextVar("_AT_CHECKPOI
 
 @contextmanager
 def at_checkpoints(call: Callable[[], None]) -> Iterator[None]:
-    """Call a function at each :func:`checkpoint` of the block; an error that it raises ends the work."""
-    token = _AT_CHECKPOINT.set(call)
+    """Call a function at each :func:`checkpoint` of the block; an error that it raises ends the work.
+
+    Before it, what a block around this one calls is called.
+    """
+    outer = _AT_CHECKPOINT.get()
+
+    def both() -> None:
+        if outer is not None:
+            outer()
+        call()
+
+    token = _AT_CHECKPOINT.set(both)
     try:
         yield
     finally:
@@ -63,3 +74,23 @@ def checkpoint() -> None:
     call = _AT_CHECKPOINT.get()
     if call is not None:
         call()
+
+
+@contextmanager
+def run_beside(work: Callable[[], Result]) -> Iterator[Future[Result]]:
+    """Work on another thread during the block; at its end, work that goes on ends at its next :func:`checkpoint`."""
+    is_over = Event()
+
+    def check() -> None:
+        if is_over.is_set():
+            raise CancelledError
+
+    def run() -> Result:
+        with at_checkpoints(check):
+            return work()
+
+    with ThreadPoolExecutor(1, "beside") as pool:
+        try:
+            yield pool.submit(copy_context().run, run)
+        finally:
+            is_over.set()

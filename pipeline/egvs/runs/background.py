@@ -11,13 +11,14 @@ the other files as they were. A killed run may leave ``.pending``; the next run 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent import futures
 from contextlib import ExitStack, contextmanager
 from contextvars import copy_context
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import threads
@@ -26,7 +27,10 @@ from egvs.runs import stage_registry
 from egvs.runs.stage_keys import StageKey
 from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
-from egvs.stages.base import StageContext
+from egvs.stages.base import StageContext, WorkAhead
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 class BackgroundStage:
@@ -38,11 +42,14 @@ class BackgroundStage:
         The stage, and what its artefacts depend on.
     context
         The run folder and the inputs.
+    ahead
+        Work of other stages on the trajectories, by stage.
     """
 
-    def __init__(self, name: str, key: StageKey, context: StageContext) -> None:
+    def __init__(self, name: str, key: StageKey, context: StageContext, ahead: Mapping[str, WorkAhead]) -> None:
         self.key = key.key
         self._name = name
+        self.ahead = ahead
         self._dependencies = key.dependencies
         self._context = context
         self._pending = RunFolder(context.folder.pending)
@@ -77,8 +84,13 @@ class BackgroundStage:
 
     def _run(self) -> StageResult:
         context = self._context.with_folder(self._pending, self._report_progress)
+        context = replace(context, follow=self._follow)
         with threads.at_checkpoints(self._check_in):
             return stage_registry.run_stage(self._name, context, self._dependencies)
+
+    def _follow(self, rows: pa.Table) -> None:
+        for work in self.ahead.values():
+            work.add(rows)
 
     def _check_in(self) -> None:
         self._can_go_on.set()
@@ -130,7 +142,7 @@ class BackgroundStage:
 
 @contextmanager
 def run_in_background(
-    name: str, key: StageKey | None, context: StageContext, store: Store
+    name: str, key: StageKey | None, context: StageContext, store: Store, ahead: Mapping[str, WorkAhead]
 ) -> Iterator[BackgroundStage | None]:
     """Run a stage in the background during the block; nothing of it is left but what its ``result`` has moved.
 
@@ -140,6 +152,8 @@ def run_in_background(
         The stage, and what its artefacts depend on; no stage if None.
     context
         The run folder and the inputs.
+    ahead
+        Work of other stages on the trajectories, by stage: it gets each row group.
     store
         Where results are cached; the entry of the stage is reserved until :meth:`BackgroundStage.close`.
 
@@ -155,7 +169,7 @@ def run_in_background(
     if key is None:
         yield None
         return
-    stage = BackgroundStage(name, key, context)
+    stage = BackgroundStage(name, key, context, ahead)
     try:
         is_started = stage.start(store)
         if not is_started:

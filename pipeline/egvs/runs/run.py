@@ -3,9 +3,9 @@
 :func:`run` brings every stage up to date. A stage is skipped when its key (settings by value, files by hash, source of
 the program) is that of the last run and its artefacts are unchanged; otherwise it is restored from the store, or runs
 and its artefacts are saved in the store. Stages take turns; only SUMO simulates in the background from the beginning
-(:mod:`egvs.runs.background`). ``run.json`` is written after each stage that made something, with that stage and those
-before it: an interrupted run continues from there, and no record names artefacts of another scenario. A run that is
-rejected before any stage ran leaves the folder as it was.
+(:mod:`egvs.runs.background`), and its frames are written and counted as they come. ``run.json`` is written after each
+stage that made something, with that stage and those before it: an interrupted run continues from there, and no record
+names artefacts of another scenario. A run that is rejected before any stage ran leaves the folder as it was.
 
 User files are not overwritten: no input lies where a run writes, and nothing is written through a link.
 """
@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -42,7 +42,7 @@ from egvs.runs.store import Store
 from egvs.scenario.loading import check_is_scenario, scenario_from_dict
 from egvs.scenario.model import Scenario
 from egvs.stages import inputs as stage_inputs
-from egvs.stages.base import StageContext
+from egvs.stages.base import StageContext, WorkAhead
 from egvs.stages.inputs import Inputs
 from egvs.traffic.sumo_folder import NETWORK_FILE
 
@@ -340,6 +340,8 @@ class _Run:
         Whether stages that read artefacts run again, and their artefacts are compared with the recorded ones.
     background
         A stage that has been started before its turn.
+    ahead
+        Work of stages on the trajectories that the background has made.
     compiler
         Compiles kernels in another process.
     """
@@ -352,6 +354,7 @@ class _Run:
     has_changed: bool = False
     is_rehash: bool = False
     background: BackgroundStage | None = None
+    ahead: Mapping[str, WorkAhead] = field(default_factory=dict)
     compiler: KernelCompiler = field(default_factory=KernelCompiler)
 
     def run_stages(self, names: Collection[str], options: StageOptions) -> RunRecord:
@@ -360,10 +363,22 @@ class _Run:
         key = None
         if "traffic" in stages and "traffic" not in options:
             key = self.key_to_simulate()
-        with run_in_background("traffic", key, self.context, self.store) as self.background, self.compiler:
+        with ExitStack() as stack:
+            ahead = {} if key is None else self._begin_ahead(stages, stack)
+            self.background = stack.enter_context(run_in_background("traffic", key, self.context, self.store, ahead))
+            stack.enter_context(self.compiler)
             for number, stage in enumerate(stages, 1):
                 self.ensure_stage(stage, options.get(stage, {}), next_stages=stages[number:])
             return self.finish(keep=names, keep_views=True)
+
+    def _begin_ahead(self, stages: Iterable[str], stack: ExitStack) -> dict[str, WorkAhead]:
+        """Begin the work of some stages that goes on while SUMO simulates; it ends with ``stack``."""
+        ahead = {}
+        for name in stage_registry.AHEAD_STAGES & set(stages):
+            begin = stage_registry.stage(name).ahead
+            if begin is not None and (work := stack.enter_context(begin(self.context))) is not None:
+                ahead[name] = work
+        return ahead
 
     def key_to_simulate(self) -> StageKey | None:
         """Return the key of the traffic stage if SUMO has to simulate; None, too, where an error comes before that."""
@@ -401,7 +416,8 @@ class _Run:
         def make() -> StageResult:
             self.listener(name, "runs", None)
             self.compiler.before(name, next_stages)
-            return stage_registry.run_stage(name, self.context, key.dependencies, **options)
+            ahead = {"ahead": self.ahead[name]} if name in self.ahead else {}
+            return stage_registry.run_stage(name, self.context, key.dependencies, **options, **ahead)
 
         fetched = False
         if has_options:
@@ -414,6 +430,7 @@ class _Run:
             result = self.background.result(self._preparations([name, *next_stages]))
             self.store.put(name, key.key, self.context.folder.path, result)
             self.background.close()
+            self.ahead = self.background.ahead
         else:
             result, fetched = fetch_or_run(name, self.context, key.key, self.store, make)
         stage_record = key.record(result)

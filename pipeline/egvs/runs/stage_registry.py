@@ -27,6 +27,9 @@ STAGE_MODULES = {
 }
 """Stage -> module with its declaration, ``STAGE``. Names, because runs do not know who presents them."""
 
+AHEAD_STAGES = frozenset({"tpog"})
+"""The stages that work ahead, by name: to load the others now would delay SUMO."""
+
 RANKING_STAGES = STAGE_NAMES[1:-1]
 """The stages that a ranking needs: all but the check and the report."""
 

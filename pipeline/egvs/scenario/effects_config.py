@@ -48,9 +48,7 @@ class RangeLimitParameters(EffectParameters):
     softness: float | None = Field(
         None, ge=0, description="Standard deviation of the logarithm of the received power. By default each sensor's"
     )
-    dropout: float | None = Field(
-        None, ge=0, le=1, description="Share of returns that are lost at any range. By default each sensor's"
-    )
+    dropout: float | None = Field(None, ge=0, le=1, description="Share lost at any range. By default each sensor's")
     rated_range_m: float | None = Field(None, gt=0, description="Rated range, instead of each sensor's")
     rated_reflectivity: float | None = Field(None, gt=0, description="Rated reflectivity, instead of each sensor's")
 
@@ -68,9 +66,7 @@ class FogParameters(EffectParameters):
     """Two-way extinction by fog."""
 
     visibility_m: float = Field(gt=0, description="Visibility: below 1000 in fog, below 200 in dense fog")
-    model: Literal["kim", "kruse"] = Field(
-        "kim", description="Model for the exponent of the wavelength as a function of the visibility"
-    )
+    model: Literal["kim", "kruse"] = Field("kim", description="Model for the exponent of the wavelength")
     contrast: float = Field(
         0.02, gt=0, lt=1, description="Contrast of visibility_m; 0.05 for meteorological optical range"
     )
@@ -99,9 +95,7 @@ class SurfaceLossesParameters(EffectParameters):
 class RangeNoiseParameters(EffectParameters):
     """Range noise that grows with range and incidence, in simulated point clouds."""
 
-    footprint_mrad: float = Field(
-        0.037, ge=0, le=10, description="Standard deviation per metre of range and tangent of the incidence, 1e-3"
-    )
+    footprint_mrad: float = Field(0.037, ge=0, le=10, description="Noise by range and tangent of the incidence, 1e-3")
     max_sigma_m: float = Field(0.1, ge=0, le=10, description="Largest standard deviation that is added")
 
 
@@ -137,6 +131,13 @@ class DivergenceParameters(EffectParameters):
     divergence_mrad: tuple[_Mrad, _Mrad] | None = Field(
         None, description="Full angles in azimuth and elevation, at 1/e^2. By default those of each sensor"
     )
+
+
+class MixedReturnsParameters(DivergenceParameters):
+    """Returns between two surfaces where a beam meets an edge, in simulated point clouds."""
+
+    pulse_ns: float = Field(5.0, gt=0, le=100, description="Duration of the pulse: 5 resolves surfaces 0.75 m apart")
+    returns: Literal["strongest", "first"] = Field("strongest", description="The echo that the sensor reports")
 
 
 class MountSwayParameters(EffectParameters):
@@ -226,6 +227,7 @@ class EffectsConfig(StrictModel):
     moving_occlusion: MovingOcclusionParameters | None = None
     divergence: DivergenceParameters | None = None
     mount_sway: MountSwayParameters | None = None
+    mixed_returns: MixedReturnsParameters | None = None
     foliage: FoliageParameters | None = None
     pedestrians_bicycles: PedestriansBicyclesParameters | None = None
     articulated: ArticulatedParameters | None = None

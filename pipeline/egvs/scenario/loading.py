@@ -13,6 +13,7 @@ import difflib
 import json
 import os
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -454,7 +455,8 @@ def json_schema() -> str:
 def _suggest_scenario(folder: Path) -> str:
     """Return a hint at the scenario that may be meant by another folder."""
     if (folder / "city.toml").is_file():
-        return f"This is a city. Use egvs city run {folder}, or one of its junctions, {folder / 'junctions'}/ID."
+        command = f"egvs city run {shlex.quote(str(folder))}"
+        return f"This is a city. Use {command}, or one of its junctions, {folder / 'junctions'}/ID."
     if (folder / _RUN_RECORD).is_file():
         return f"This is a run folder. Give the scenario's folder{_recorded_folder(folder)}."
     return f"Give a folder with a {SCENARIO_FILE}, or the file."

@@ -8,8 +8,9 @@ so a stage whose dependencies did not change is skipped. No stage imports anothe
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Concatenate
+from typing import TYPE_CHECKING, Any, Concatenate, Protocol
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFile, RunFolder
@@ -19,6 +20,8 @@ from egvs.scenario.model import Scenario
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    import pyarrow as pa
 
     from egvs.sensors.scene import Scene
     from egvs.stages.inputs import Inputs
@@ -58,6 +61,13 @@ class StageDependencies:
         return {"settings": self.settings, "files": self.files, **self.more}
 
 
+class WorkAhead(Protocol):
+    """Work on trajectories that are still being made."""
+
+    def add(self, rows: pa.Table) -> None:
+        """Take the next row group."""
+
+
 @dataclass(frozen=True)
 class Stage:
     """Declaration of a stage.
@@ -88,6 +98,9 @@ class Stage:
     prepare
         Functions that load what ``run`` calls, for example by calling kernels with made-up arguments, which compiles
         them in the first run; the function that takes longest comes first.
+    ahead
+        Begins to work on the trajectories while they are made, during a block; what it yields gets each row group and
+        is the option ``ahead`` of ``run`` then. It yields None where there is nothing to do ahead.
     """
 
     name: str
@@ -101,6 +114,7 @@ class Stage:
     reads_traffic: bool = False
     is_view: bool = False
     prepare: tuple[Callable[[], None], ...] = ()
+    ahead: Callable[[StageContext], AbstractContextManager[WorkAhead | None]] | None = None
 
     @property
     def artefacts(self) -> tuple[str, ...]:
@@ -129,6 +143,8 @@ class StageContext:
         Number of threads. Results do not depend on it.
     progress
         Called as the work proceeds.
+    follow
+        Called with each row group of the trajectories that is written, as long as they are made.
     """
 
     scenario: Scenario
@@ -136,6 +152,7 @@ class StageContext:
     folder: RunFolder
     threads: int
     progress: ProgressCallback = no_progress
+    follow: parquet.Follow | None = None
 
     def with_scenario(self, scenario: Scenario) -> StageContext:
         """Return the context of a scenario with other [score], [placement] or [scan]; both share the scene.

@@ -2,33 +2,42 @@
 
 Steps: read ``trajectories.parquet`` a few hundred frames at a time; count occupancy block by block
 (:mod:`egvs.scoring.occupancy`); leave out the voxels that static geometry fills; write the sparse counts. Blocks are
-consecutive and of equal length; counts of several TPOGs on one grid add up. Frames at the end of a finished file that
+consecutive and of equal length; counts of several TPOGs on one grid add up. While SUMO simulates, :class:`BlocksAhead`
+counts them. Frames at the end of a finished file that
 fill no block are left out, and reported.
 """
 
 from __future__ import annotations
 
+import queue
 from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY, FrameBoxes, read_boxes
+from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY, BoxReader, FrameBoxes, read_boxes
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import PeriodBlocks, frame_multiplicities
 from egvs.core.errors import WARNINGS_KEY, InputError
 from egvs.core.grid import Grid, IntArray
 from egvs.core.progress import ProgressCallback
+from egvs.core.threads import checkpoint, run_beside
 from egvs.scenario.model import Scenario
 from egvs.scoring import occupancy
 from egvs.scoring.occupancy import BlockCounts, count_blocks, static_voxels
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.statistics.blocks import autocorrelation_time
 from egvs.world.mesh import World
+
+_WAIT_S = 0.1
+"""Time between two looks whether the run has ended."""
 
 if TYPE_CHECKING:
     from egvs.scoring.unknown_occupancy import UnknownOccupancy
@@ -51,7 +60,7 @@ def _weights(scenario: Scenario) -> dict[str, float]:
     return {period.name: period.weight for period in scenario.traffic.periods}
 
 
-def run(context: StageContext, inputs: StageDependencies) -> Summary:
+def run(context: StageContext, inputs: StageDependencies, ahead: BlocksAhead | None = None) -> Summary:
     """Count occupancy and write ``tpog.parquet``.
 
     Parameters
@@ -60,6 +69,8 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
         The run folder, with trajectories and statics.
     inputs
         What the TPOG depends on.
+    ahead
+        Blocks of these trajectories, counted while they were written.
 
     Returns
     -------
@@ -83,7 +94,10 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
         for name, recorded, seeds, boxes in _recorded_periods(source, grid):
             unused = _leftover_frames(by_period.get(name, scenario), recorded)
             frames = recorded - unused
-            blocks = count_blocks(boxes, grid, frames // n_blocks, n_blocks)
+            if ahead is not None and ahead.frames == recorded:
+                blocks = ahead.blocks()
+            else:
+                blocks = count_blocks(boxes, grid, frames // n_blocks, n_blocks)
             if unknown is not None:
                 blocks = _known_blocks(blocks, unknown, first_frame)
             first_frame += recorded
@@ -126,6 +140,84 @@ def prepare() -> None:
     occupancy.count_occupancy(box, grid, 1)
     face, solid = np.array([[0, 1, 2]], dtype=np.int32), np.zeros(1, dtype=np.int32)
     static_voxels(World(np.eye(3), face, solid, (("triangle", "wall"),)), grid)
+
+
+class BlocksAhead:
+    """Counts the blocks of a recording while its frames are written, in a thread of its own.
+
+    Parameters
+    ----------
+    scenario
+        The scenario; without periods, with a known number of frames that the blocks share.
+    path
+        The trajectories, for messages.
+
+    Attributes
+    ----------
+    frames
+        Number of frames that are expected.
+    counting
+        The thread that counts.
+    """
+
+    def __init__(self, scenario: Scenario, path: Path) -> None:
+        assert scenario.traffic.frames is not None
+        self.frames = scenario.traffic.frames
+        self._grid, self._n_blocks = scenario.roi.grid, scenario.tpog.blocks
+        self._reader = BoxReader(path, self._grid)
+        self._rows: queue.SimpleQueue[pa.Table | None] = queue.SimpleQueue()
+        self.counting: Future[list[_SparseBlock]] | None = None
+
+    def add(self, rows: pa.Table) -> None:
+        """Add the next row group."""
+        self._rows.put(rows)
+
+    def blocks(self) -> Iterator[BlockCounts]:
+        """Yield the blocks, after the last row group was added."""
+        assert self.counting is not None, "begun by count_ahead"
+        self._rows.put(None)
+        for flat, counts, boxes_per_frame in self.counting.result():
+            dense = np.zeros(self._grid.shape, dtype=np.int32)
+            dense.ravel()[flat] = counts
+            yield BlockCounts(dense, boxes_per_frame)
+
+    def count(self) -> list[_SparseBlock]:
+        """Count until the last row group."""
+        blocks = []
+        for counts, boxes in count_blocks(self._boxes(), self._grid, self.frames // self._n_blocks, self._n_blocks):
+            flat = np.flatnonzero(counts)
+            blocks.append(_SparseBlock(flat, counts.ravel()[flat], boxes))
+        return blocks
+
+    def _boxes(self) -> Iterator[FrameBoxes]:
+        while True:
+            checkpoint()
+            with suppress(queue.Empty):
+                rows = self._rows.get(timeout=_WAIT_S)
+                if rows is None:
+                    return
+                if rows.num_rows:
+                    yield self._reader.read(rows)
+
+
+@contextmanager
+def count_ahead(context: StageContext) -> Iterator[BlocksAhead | None]:
+    """Count the blocks of a simulation during the block; None for periods, whose numbers of frames are not known."""
+    traffic = context.scenario.traffic
+    if traffic.periods or traffic.frames is None or traffic.frames % context.scenario.tpog.blocks:
+        yield None
+        return
+    blocks = BlocksAhead(context.scenario, context.folder.trajectories)
+    with run_beside(blocks.count) as blocks.counting:
+        yield blocks
+
+
+class _SparseBlock(NamedTuple):
+    """Voxels of a block that are occupied, their counts, and the number of boxes near the region in each frame."""
+
+    flat: IntArray
+    counts: NDArray[np.int32]
+    boxes_per_frame: IntArray
 
 
 @dataclass
@@ -257,5 +349,7 @@ STAGE = Stage(
     run,
     reads=(RunFolder.trajectories, RunFolder.statics),
     code=("egvs.world.mesh",),
+    neutral_options=("ahead",),
     prepare=(prepare,),
+    ahead=count_ahead,
 )

@@ -26,7 +26,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY
 from egvs.core.errors import WARNINGS_KEY, InputError, MissingBackendError
 from egvs.core.platform import relative_path
-from egvs.core.progress import SummedProgress
+from egvs.core.progress import SummedProgress, no_progress
 from egvs.core.sumo_home import sumo_home
 from egvs.core.threads import map_ordered
 from egvs.effects import registry
@@ -162,7 +162,7 @@ def run(context: StageContext, inputs: StageDependencies, traci: tuple[str, int]
     periods = []
     unknown_boxes: list[dict[str, Any]] = []
     frames = 0
-    with parquet.artefact_writer(context.folder.trajectories, "trajectories") as file:
+    with parquet.artefact_writer(context.folder.trajectories, "trajectories", follow=context.follow) as file:
         for name, scenario in context.scenario.by_period().items():
             window, summaries[name], unknown = _record_period(context, scenario, name, file, frames, traci)
             unknown_boxes += unknown
@@ -249,7 +249,9 @@ def _record_runs(
         if len(runs) > 1:
             folder /= f"seed{number + 1}"
         return simulations.enter_context(
-            recording.record_traffic(runs[number], folder, effects, progress.part(number), traci, georeference, regions)
+            recording.record_traffic(
+                runs[number], folder, effects, progress.part(number), traci, georeference, regions, live=len(runs) == 1
+            )
         )
 
     # a copy for each thread, so that a run in the background can be told to end
@@ -268,8 +270,9 @@ def _write_run(
     name_prefix: str,
 ) -> tuple[Summary, list[dict[str, Any]]]:
     """Write the frames of one simulation, or of a finished file; return its summary, and the unknown positions."""
+    progress = no_progress if recorded.is_live else context.progress  # SUMO's progress is reported then
     tally, reports = trajectories.write_trajectories(
-        scenario, recorded, effects, file, context.progress, first_frame, name_prefix
+        scenario, recorded, effects, file, progress, first_frame, name_prefix
     )
     sumo_summary = recorded.summary()
     warnings = trajectories.traffic_warnings(tally, recorded, scenario.roi.box, recording.demand_key(scenario))

@@ -15,11 +15,12 @@ from __future__ import annotations
 import itertools
 import shutil
 import tempfile
-from collections.abc import Generator, Iterable, Iterator
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -50,6 +51,9 @@ _OTHER_PREFIXES = {"vehicle": ("person_", "container_"), "person": ("vehicle_", 
 
 _BLOCK_BYTES = 1 << 20
 """Arrow reads dozens of blocks ahead: with 4 MiB they take 150 MB, and reading is no faster."""
+
+_WAIT_S = 0.05
+"""Time between two looks at a file that grows."""
 
 _BATCH_ROWS = 1 << 16
 _MAX_ROWS_PER_BYTE = 10
@@ -147,6 +151,26 @@ def read_fcd(path: Path, element: str = "vehicle") -> Iterator[pa.Table]:
     yield from _checked_tables(*_source_batches(path, element))
 
 
+def read_growing_fcd(path: Path, element: str, has_ended: Callable[[], bool]) -> Iterator[pa.Table]:
+    """Read a CSV file while SUMO writes it, and to its end.
+
+    Parameters
+    ----------
+    path
+        The file; it need not exist yet.
+    element
+        As for :func:`read_fcd`.
+    has_ended
+        Whether nothing will be added. An error that it raises ends the reading, before the last lines are read.
+
+    Yields
+    ------
+    pyarrow.Table
+        The rows that :func:`read_fcd` yields of the complete file; none of a file without vehicles.
+    """
+    yield from _checked_tables(_read_growing_csv(path, element, has_ended), path, "row")
+
+
 def _source_batches(path: Path, element: str) -> tuple[Generator[pa.RecordBatch, None, None], Path, str]:
     """Return the batches of a file with the columns that are used, the file, and what it calls a row."""
     if not path.is_file():
@@ -168,25 +192,75 @@ def _read_csv(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]
         reading.translate_errors(path, _COMPLETE_FILE, "its first line cannot be read"),
         xml.open_bounded(path) as file,
     ):
-        header = xml.read_line(file, path).decode("utf-8").lstrip("\ufeff").strip()
-    delimiter = ";" if ";" in header else ","
-    columns = _source_columns([name.strip('"') for name in header.split(delimiter)], path, element)
-    types = dict.fromkeys(columns.values(), pa.float64())
-    types.update((columns[name], pa.string()) for name in _STRINGS)
-    convert = csv.ConvertOptions(
-        column_types=types,
-        include_columns=list(columns.values()),
-        null_values=[""],
-        strings_can_be_null=True,
-    )
+        header = xml.read_line(file, path)
+    layout = _CsvLayout.of(header, path, element)
     options = csv.ReadOptions(block_size=_BLOCK_BYTES, use_threads=False)
     with (
         reading.translate_errors(path, _COMPLETE_FILE, "cannot be read as CSV"),
         xml.open_bounded(path) as stream,
-        csv.open_csv(stream, options, csv.ParseOptions(delimiter=delimiter), convert) as batches,
+        csv.open_csv(stream, options, layout.parse, layout.convert) as batches,
     ):
         for batch in batches:
-            yield batch.rename_columns(list(columns))
+            yield batch.rename_columns(layout.columns)
+
+
+def _read_growing_csv(path: Path, element: str, has_ended: Callable[[], bool]) -> Generator[pa.RecordBatch, None, None]:
+    from pyarrow import csv
+
+    while not path.is_file() and not has_ended():
+        time.sleep(_WAIT_S)
+    layout: _CsvLayout | None = None
+    names: list[str] = []
+    content = b""
+    with path.open("rb") as file:
+        is_last = False
+        while not is_last:
+            is_last = has_ended()  # before reading
+            content += file.read()
+            if not is_last and len(content) < _BLOCK_BYTES:
+                time.sleep(_WAIT_S)
+                continue
+            lines, line_end, content = content.rpartition(b"\n")
+            if not line_end:
+                continue
+            if layout is None:
+                header, _, lines = lines.partition(b"\n")
+                if not header:
+                    return  # SUMO writes a line end if there is no vehicle
+                layout = _CsvLayout.of(header, path, element)
+                names = header.decode("utf-8").split(layout.parse.delimiter)
+            if not lines:
+                continue
+            options = csv.ReadOptions(column_names=names, use_threads=False)
+            table = csv.read_csv(pa.BufferReader(lines + line_end), options, layout.parse, layout.convert)
+            yield from table.rename_columns(layout.columns).combine_chunks().to_batches()
+
+
+class _CsvLayout(NamedTuple):
+    """The columns of a CSV file that are used, by the names of :data:`FCD_SCHEMA`, and how it is read."""
+
+    columns: list[str]
+    parse: Any
+    convert: Any
+
+    @classmethod
+    def of(cls, header: bytes, path: Path, element: str) -> _CsvLayout:
+        """Return the layout that the first line of a file implies."""
+        from pyarrow import csv
+
+        with reading.translate_errors(path, _COMPLETE_FILE, "its first line cannot be read"):
+            line = header.decode("utf-8").lstrip("\ufeff").strip()
+        delimiter = ";" if ";" in line else ","
+        columns = _source_columns([name.strip('"') for name in line.split(delimiter)], path, element)
+        types = dict.fromkeys(columns.values(), pa.float64())
+        types.update((columns[name], pa.string()) for name in _STRINGS)
+        convert = csv.ConvertOptions(
+            column_types=types,
+            include_columns=list(columns.values()),
+            null_values=[""],
+            strings_can_be_null=True,
+        )
+        return cls(list(columns), csv.ParseOptions(delimiter=delimiter), convert)
 
 
 def _read_parquet(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -19,7 +21,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from egvs.core import limits
+from egvs.core import limits, threads
 from egvs.core.errors import Diagnostic, InputError, RunError
 from egvs.core.progress import ProgressCallback
 from egvs.core.resource_usage import peak_memory_of
@@ -88,13 +90,17 @@ class Recording:
     persons
         Rows of persons, where they are not among ``rows``.
     summary
-        Returns the summary after all rows have been read; None for a finished file.
+        Returns the summary after ``finish``; None for a finished file.
     source
         Source of the rows, for messages; empty for a running SUMO.
     roads
         The simulated network, for messages; None if it is not known.
+    finish
+        Waits for the end of the simulation after all rows have been read, and raises its error.
+    is_live
+        Whether rows are read while they are simulated.
     teleports
-        Vehicles that SUMO moved on.
+        Returns the vehicles that SUMO moved on, after ``finish``.
     locked
         Why a watched region is locked, by name; only locked regions. None where no region was watched.
     types
@@ -120,7 +126,9 @@ class Recording:
     summary: Callable[[], RecordingSummary | None] = lambda: None
     source: str = ""
     roads: network.Network | None = None
-    teleports: Sequence[locks.Teleport] = ()
+    finish: Callable[[], Any] = lambda: None
+    is_live: bool = False
+    teleports: Callable[[], Sequence[locks.Teleport]] = list
     locked: Mapping[str, str] | None = None
     types: Mapping[str, finished_fcd.SizedType] = field(default_factory=dict)
     uncounted_types: frozenset[str] = frozenset()
@@ -137,6 +145,8 @@ def record_traffic(
     traci: tuple[str, int] | None,
     world: Georeference,
     regions: Mapping[str, WatchedRegion] | None = None,
+    *,
+    live: bool = False,
 ) -> AbstractContextManager[Recording]:
     """Record the traffic of a scenario.
 
@@ -157,6 +167,8 @@ def record_traffic(
     regions
         SUMO is stopped, with an error, as soon as the traffic in all these regions is locked. They are watched if the
         demand is generated: vehicles of a user's demand may stop on purpose.
+    live
+        Rows of a generated demand may be read while SUMO simulates; otherwise it ends before the block begins.
 
     Returns
     -------
@@ -181,7 +193,7 @@ def record_traffic(
         return _record_tracks(scenario, folder, world)
     if traci is not None:
         return _record_running(scenario, *traci, extensions)
-    return _record_simulated(scenario, folder, progress, extensions, regions or {}, world)
+    return _record_simulated(scenario, folder, progress, extensions, regions or {}, world, live)
 
 
 @contextmanager
@@ -278,6 +290,7 @@ def _record_simulated(
     extensions: Sequence[TrafficHook],
     regions: Mapping[str, WatchedRegion],
     world: Georeference,
+    live: bool,
 ) -> Iterator[Recording]:
     where = sumo_folder.traffic_location(scenario)
     people = _recorded_people(scenario, extensions, world)
@@ -295,46 +308,38 @@ def _record_simulated(
             watch = RegionWatch(
                 fcd, log, prepared.timing, regions, prepared.roads, sizes, demand_key(scenario), prepared.teleport_s
             )
-        seconds, peak_mb = simulate(prepared, progress, watch)
+        with threads.run_beside(partial(simulate, prepared, progress, watch)) as simulation:
+            is_live = live and prepared.is_generated
+            if not is_live:
+                simulation.result()
+            has_people = prepared.has_extra_traffic
+            persons = _read_rows(folder / sumo_folder.PERSONS_FILE, "person", simulation) if has_people else None
+            people_values: dict[str, Any] = {}
+            if people is not None:
+                persons = people.rows
+                sizes |= people.sizes
+                people_values = _values_of(people)
+            yield Recording(
+                _read_rows(folder / sumo_folder.FCD_FILE, "vehicle", simulation),
+                prepared.timing.window(),
+                sizes,
+                where,
+                standing_limit_s(prepared.roads.cycle_s),
+                prepared.vehicles,
+                _planned_stops(prepared),
+                persons,
+                partial(_summarize, scenario, prepared, simulation),
+                f"{where} ({sources})",
+                prepared.roads,
+                simulation.result,
+                is_live,
+                partial(_read_teleports, prepared, scenario),
+                None if watch is None else watch.locked,
+                **people_values,
+            )
     except sumo.SumoInputError as error:
         hint = "Correct these files; SUMO read copies of them."
         raise error.for_input(where, f"SUMO cannot run {sources}", hint) from None
-    else:
-        collisions = _read_collisions(prepared)
-        fits, warnings = _compare_counts(scenario, prepared)
-        teleports = _read_teleports(prepared, scenario)
-        warnings += [
-            *_collision_warning(collisions, scenario),
-            *_insertion_warning(prepared, scenario, fits),
-            *_teleport_warning(teleports, prepared, scenario),
-        ]
-        flags = sumo_folder.as_flags(prepared.options | prepared.outputs)
-        summary = RecordingSummary(
-            sumo.sumo_version(), seconds, flags, len(collisions), len(teleports), peak_mb, prepared.notes,
-            fits, warnings,
-        )  # fmt: skip
-        persons = _read_rows(folder / sumo_folder.PERSONS_FILE, "person") if prepared.has_extra_traffic else None
-        people_values: dict[str, Any] = {}
-        if people is not None:
-            persons = people.rows
-            sizes |= people.sizes
-            people_values = _values_of(people)
-        yield Recording(
-            _read_rows(folder / sumo_folder.FCD_FILE, "vehicle"),
-            prepared.timing.window(),
-            sizes,
-            where,
-            standing_limit_s(prepared.roads.cycle_s),
-            prepared.vehicles,
-            _planned_stops(prepared),
-            persons,
-            lambda: summary,
-            f"{where} ({sources})",
-            prepared.roads,
-            teleports,
-            None if watch is None else watch.locked,
-            **people_values,
-        )
     finally:
         for name in (*_TABLES, sumo_folder.DRIVEN_ROUTES_FILE, sumo_folder.STATISTICS_FILE):
             (folder / name).unlink(missing_ok=True)
@@ -359,9 +364,28 @@ def check_recorded_people(scenario: Scenario, extensions: Iterable[TrafficHook])
         raise InputError(where, problem, "Remove effects.pedestrians_bicycles, or pedestrian_tracks.")
 
 
-def _read_rows(path: Path, element: str) -> Iterable[pa.Table]:
-    """Read an FCD file that SUMO wrote; without rows, it is a line end without a header."""
-    return fcd.read_fcd(path, element) if path.stat().st_size > 1 else ()
+def _read_rows(path: Path, element: str, simulation: Future[Any]) -> Iterable[pa.Table]:
+    """Read an FCD file that SUMO writes until a simulation ends; the error of the simulation comes first."""
+    return fcd.read_growing_fcd(path, element, lambda: simulation.done() and simulation.result() is not None)
+
+
+def _summarize(
+    scenario: Scenario, prepared: SimulationFolder, simulation: Future[tuple[float, float | None]]
+) -> RecordingSummary:
+    """Return what SUMO did, after its end."""
+    seconds, peak_mb = simulation.result()
+    collisions = _read_collisions(prepared)
+    fits, warnings = _compare_counts(scenario, prepared)
+    teleports = _read_teleports(prepared, scenario)
+    warnings += [
+        *_collision_warning(collisions, scenario),
+        *_insertion_warning(prepared, scenario, fits),
+        *_teleport_warning(teleports, prepared, scenario),
+    ]
+    flags = sumo_folder.as_flags(prepared.options | prepared.outputs)
+    return RecordingSummary(
+        sumo.sumo_version(), seconds, flags, len(collisions), len(teleports), peak_mb, prepared.notes, fits, warnings
+    )
 
 
 @contextmanager
@@ -591,6 +615,7 @@ def simulate(
     check_complete(prepared)
     if region_watch is not None:
         region_watch.finish()
+    progress("frames simulated", timing.frames, timing.frames)
     peak_mb = round(max(peaks_mb), 1) if peaks_mb else None
     return round(perf_counter() - start, 3), peak_mb
 

@@ -432,6 +432,7 @@ def write_trajectories(
             file.write(boxes.columns(first_frame, name_prefix))
         statistics.add(boxes)
         progress("frames written", group.first_frame + group.frames, statistics.frames)
+    recording.finish()
     check_recording(scenario, statistics, recording)
     summaries: dict[str, Any] = {}
     for change in changes or ():

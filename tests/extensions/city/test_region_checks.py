@@ -91,7 +91,7 @@ def test_planned_stop_is_no_lock() -> None:
 def test_region_with_many_teleports_is_locked(tmp_path: Path, teleports: int, vehicles: int, locked: bool) -> None:
     (tmp_path / "net.xml").write_text(NET)
     moved = [Teleport(f"v{i}", "yield", "a_0", 150.0) for i in range(teleports)]
-    checks = RegionChecks(REGIONS, recording(roads=read_net_xml(tmp_path / "net.xml"), teleports=moved))
+    checks = RegionChecks(REGIONS, recording(roads=read_net_xml(tmp_path / "net.xml"), teleports=lambda: moved))
     checks.check_teleports({"west": vehicles, "east": vehicles})
     assert list(checks.locked) == (["west"] if locked else [])
     if locked:
@@ -104,7 +104,7 @@ def test_watched_regions_are_not_checked_again(tmp_path: Path) -> None:
     (tmp_path / "net.xml").write_text(NET)
     moved = [Teleport(f"v{i}", "yield", "a_0", 150.0) for i in range(100)]
     roads = read_net_xml(tmp_path / "net.xml")
-    watched = recording(roads=roads, teleports=moved, locked={"east": "vehicle 'a' stood at junction W"})
+    watched = recording(roads=roads, teleports=lambda: moved, locked={"east": "vehicle 'a' stood at junction W"})
     checks = RegionChecks(REGIONS, watched)
     checks.add_frames(frames_until(900), standing(a=(0, 5.0)))
     checks.check_teleports({"west": 100, "east": 100})

@@ -101,11 +101,11 @@ class RegionChecks:
         vehicles
             Number of different vehicles near each junction.
         """
-        if self.recording.locked is not None or not self.recording.teleports or self.recording.roads is None:
+        if self.recording.locked is not None or not self.recording.teleports() or self.recording.roads is None:
             return
         names = StreetNames(self.recording.roads)
         for name, region in self.regions.items():
-            inside = [teleport for teleport in self.recording.teleports if _is_in_region(teleport, names, region)]
+            inside = [teleport for teleport in self.recording.teleports() if _is_in_region(teleport, names, region)]
             if not locks.are_too_many_teleports(len(inside), vehicles[name]):
                 continue
             ((place, number),) = Counter(names.of_lane(teleport.lane) for teleport in inside).most_common(1)

@@ -333,7 +333,8 @@ def _method_section(record: HeldOutTraffic, sites: Sequence[SiteSummary]) -> str
         f"- Range noise (standard deviation): {noise}.",
         f"- Effects on beams and returns: {beam_effects or 'none'}; on traffic: {traffic_effects or 'none'}.",
         *(f"- Inactive effect: {effect.name} ({effect.why})." for effect in scene.inactive_effects),
-        "- Not modelled: rolling shutter (a frame is one instant), second returns, mixed returns at edges.",
+        "- Not modelled: rolling shutter (a frame is one instant), second returns; without the effect mixed_returns,"
+        " mixed returns at edges.",
     ]
     return "\n".join(rows) + "\n"
 
