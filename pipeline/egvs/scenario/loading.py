@@ -25,6 +25,7 @@ from egvs.core import files, reading
 from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
 from egvs.core.numbers import number_or_nan
+from egvs.core.table_columns import parse_header
 from egvs.scenario.fields import NAME_DESCRIPTION
 from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario, StaticsConfig
 from egvs.scenario.settings import changed_settings, flatten_settings
@@ -325,10 +326,10 @@ def _read_counts(path: Path, where: str) -> list[dict[str, Any]]:
     first = text.partition("\n")[0]
     has_semicolons = first.count(";") > first.count(",")
     rows = csv.DictReader(text.splitlines(), delimiter=";" if has_semicolons else ",")
-    unknown = [name for name in rows.fieldnames or () if name not in (*COUNT_IDS, *COUNT_NAMES, "count", "kind")]
-    if unknown or "count" not in (rows.fieldnames or ()):
-        problem = f"unknown column {unknown[0]!r}" if unknown else "the column 'count' is missing"
-        raise InputError(path, problem, f"Columns: {', '.join((*COUNT_NAMES, *COUNT_IDS))}, count, kind.")
+    known = (*COUNT_NAMES, *COUNT_IDS, "count", "kind")
+    rows.fieldnames = parse_header(path, rows.fieldnames or (), known)
+    if "count" not in rows.fieldnames:
+        raise InputError(path, "the column 'count' is missing", f"Columns: {', '.join(known)}.")
     counts = []
     for number, row in enumerate(rows, start=2):
         count: dict[str, Any] = {key: row[key] for key in (*COUNT_IDS, "kind") if row.get(key)}

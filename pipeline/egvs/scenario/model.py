@@ -460,6 +460,12 @@ class Scenario(StrictModel):
         """The keys that the period of a scenario from :meth:`by_period` sets itself, else none."""
         return self._period_keys
 
+    def with_site_sensor(self, name: str) -> Scenario:
+        """Return the scenario with a sensor at all sites, as ``sites.replace_sensor`` sets it."""
+        changed = self.model_copy(update={"sites": self.sites.model_copy(update={"replace_sensor": name})})
+        changed._written_site_keys = self._written_site_keys - {"sensor"}
+        return changed
+
     @property
     def written_site_keys(self) -> frozenset[str]:
         """The keys of ``[sites]`` that the user wrote; none for a scenario from ``run.json``, which has all keys."""
