@@ -18,6 +18,7 @@ from egvs.creation.new_scenario import NewScenario
 from egvs.creation.openstreetmap import ATTRIBUTION, street_network
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.formats import osm
+from egvs.report import sections
 from egvs.runs import run
 from egvs.scenario import loading
 from egvs.scenario.traffic_config import CountConfig
@@ -162,6 +163,69 @@ def test_names_of_more_than_99_poles_sort_in_order() -> None:
     assert (lines[1], lines[100]) == ("k001,0.0,0.0", "k100,99.0,0.0")
 
 
+EAST_M, NORTH_M = 68_677.0, 111_267.0
+"""Metres of a degree of longitude and of latitude at 52 N."""
+
+
+def with_poles(folder: Path, **tags_at_m: tuple[str, float, float]) -> Path:
+    """Write the map with other poles: id of each (``n9001``) to its tag, metres east and metres north of the cross."""
+    nodes = ""
+    for name, (tag, east_m, north_m) in tags_at_m.items():
+        key, _, value = tag.partition("=")
+        position = f'lat="{52 + north_m / NORTH_M:.8f}" lon="{10 + east_m / EAST_M:.8f}"'
+        nodes += f'<node id="{name[1:]}" {position}><tag k="{key}" v="{value}"/></node>\n'
+    path = folder / "lamps.osm"
+    text = re.sub(r"<node id=.600[123].*?/node>", "", SMALL.read_text())
+    path.write_text(text.replace(' <node id="101"', f'{nodes} <node id="101"', 1))
+    return path
+
+
+@pytest.mark.parametrize("side", [1, -1], ids=["right", "left"])
+def test_poles_of_the_map_are_candidates(tmp_path: Path, side: int) -> None:
+    lamp = "highway=street_lamp"
+    made = create_scenario(
+        tmp_path / "out",
+        with_poles(
+            tmp_path,
+            n9001=(lamp, 12, 12),
+            n9002=(lamp, 32, -1.5),  # on the southern lane of the eastern street
+            n9003=("highway=traffic_signals", 18, 0),  # at the stop line of vehicles from the east
+            n9004=("man_made=utility_pole", -12, -12),
+            n9005=("man_made=utility_pole", -12, -12.5),
+            n9006=(lamp, 300, 12),  # far from the junction
+            n9007=("barrier=bollard", 12, -12),
+        ),
+        existing_poles=True,
+        lefthand=side < 0,
+        righthand=side > 0,
+    )
+    middle_m = made.region.junction.at_m
+    sites = {row["source"]: row for row in sites_of(tmp_path / "out")}
+    kinds = {source: row["site"].rstrip("0123456789") for source, row in sites.items()}
+    assert kinds == {"node/9001": "lamp", "node/9002": "lamp", "node/9003": "signal", "node/9004": "pole"}
+    at_m = {s: (float(r["x_m"]) - middle_m[0], float(r["y_m"]) - middle_m[1]) for s, r in sites.items()}
+    assert at_m["node/9001"] == pytest.approx((12, 12), abs=0.5)  # the map is turned by 0.8 degrees
+    assert at_m["node/9004"] == pytest.approx((-12, -12), abs=0.5)
+    lanes = MultiLineString([LineString(line) for line, _ in lanes_of(tmp_path / "out")])
+    beside_m = 3.2 / 2 + junctions.KERB_M
+    for name, x_m, sign in (("node/9002", 32, -1), ("node/9003", 18, side)):
+        assert at_m[name][0] == pytest.approx(x_m, abs=0.5)
+        assert math.copysign(1, at_m[name][1]) == sign
+        point = Point(float(sites[name]["x_m"]), float(sites[name]["y_m"]))
+        assert point.distance(lanes) == pytest.approx(beside_m, abs=0.05)
+    assert [float(sites[f"node/900{n}"]["moved_m"]) > 1 for n in (1, 2, 3, 4)] == [False, True, True, False]
+    loaded = loading.load(tmp_path / "out")
+    assert set(loaded.sites.existing_poles) == {sites["node/9001"]["site"], "pole1"}
+    assert any("positions of the poles other than" in entry for entry in sections.assumptions(loaded, []))
+    assert any("less than 1 m from another one" in note for note in made.notes)
+
+
+def test_map_without_poles_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^--poles existing: no map has a street lamp, signal mast or utility pole"):
+        create_scenario(tmp_path / "out", with_poles(tmp_path), existing_poles=True)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("spacing_m", [0.0, 1.5, 101.0, math.nan])
 def test_rejects_spacing_of_poles(tmp_path: Path, spacing_m: float) -> None:
     with pytest.raises(InputError, match=r"--poles: expected a spacing of 2 to 100 m, got .* Use a spacing such as"):
@@ -220,8 +284,8 @@ def test_command_line_takes_poles_and_demand(tmp_path: Path, run_egvs) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--poles", "each", "20m"), "--poles: expected every and a length in metres, got 'each 20m'"),
-        (("--poles", "every", "20ft"), "--poles: expected every and a length in metres, got 'every 20ft'"),
+        (("--poles", "each", "20m"), "--poles: expected existing, or every and a length in metres, got 'each'"),
+        (("--poles", "every", "20ft"), "--poles: expected existing, or every and a length in metres, got 'every 20ft'"),
         (("--traffic", "heavy", "--vehicles-per-hour", 9), "--traffic: cannot be combined with --vehicles-per-hour"),
     ],
 )

@@ -6,7 +6,7 @@ result depends on, so that the report shows an entry only while it belongs to th
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,9 +58,9 @@ def read_results(path: Path) -> dict[str, CommandResult]:
         raise InputError(path, "is not a file of results", _HINT) from None
 
 
-def write_results(path: Path, results: Mapping[str, CommandResult]) -> None:
-    """Write entries into a file, in place of those of the same names; other entries stay."""
-    entries = {**read_results(path), **results}
+def write_results(path: Path, results: Mapping[str, CommandResult], removed: Collection[str] = ()) -> None:
+    """Write entries into a file, in place of those of the same names; other entries stay but the ``removed`` ones."""
+    entries = {name: entry for name, entry in read_results(path).items() if name not in removed} | dict(results)
     value = {
         "entries": {name: {"stages": dict(entry.stages), "values": entry.values} for name, entry in entries.items()}
     }

@@ -5,6 +5,7 @@ It is written again after each stage, so that an interrupted run continues from 
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -103,7 +104,7 @@ def _suggest_run(scenario_folder: Path) -> str:
     run = Path("runs") / scenario_folder.resolve().name
     if RunFolder(run).has_record:
         return f"Did you mean {run}?"
-    return suggest_runs(run) or f"First run egvs run {scenario_folder}, then give its run folder."
+    return suggest_runs(run) or f"First run egvs run {shlex.quote(str(scenario_folder))}, then give its run folder."
 
 
 def suggest_runs(folder: Path) -> str:

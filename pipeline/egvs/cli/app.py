@@ -667,11 +667,11 @@ def new(
         ),
     ] = None,
     poles: Annotated[
-        tuple[str, str] | None,
+        str | None,
         typer.Option(
-            metavar="every METRES",
+            metavar="every METRES|existing",
             help="Candidate poles along all kerbs of the region at this spacing, e.g. every 20m, instead of at most 12"
-            " spread over the arms of the junction.",
+            " spread over the arms of the junction. existing: the lamps, signal masts and utility poles of the map.",
         ),
     ] = None,
     align: Annotated[
@@ -798,10 +798,10 @@ def new(
         demand = vehicles_per_hour
     pole_spacing_m = None
     if poles is not None:
-        pole_spacing_m = cli_options.pole_spacing_m(*poles)
+        pole_spacing_m = cli_options.pole_spacing_m(poles)
     options = NewScenarioOptions(
         lefthand=lefthand, righthand=righthand, walk=walk, surroundings_m=surroundings_m, traffic=demand,
-        pole_spacing_m=pole_spacing_m,
+        pole_spacing_m=pole_spacing_m, existing_poles=poles == "existing",
         align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
         tracks=tuple(tracks or ()), like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
         track_columns=track_columns, pedestrian_tracks=tuple(pedestrian_tracks or ()), counts=counts,

@@ -6,6 +6,7 @@ the line says which file has them.
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
@@ -37,7 +38,7 @@ def print_new_scenario(scenario: NewScenario, map_notes: Sequence[str] = ()) -> 
         out.print(f"warning: {warning}")
     if scenario.attributions:
         out.print(f"Map data {'; '.join(scenario.attributions)}")
-    out.print(f"next: egvs run {scenario.folder}")
+    out.print(f"next: {shlex.join(['egvs', 'run', str(scenario.folder)])}")
 
 
 def print_junctions(listed: Sequence[ListedJunction]) -> None:

@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperCommand
 
 from egvs.core.errors import InputError
-from egvs.core.numbers import number_or_nan
+from egvs.core.numbers import ambiguous_number, number_or_nan
 
 ScenarioPath = Annotated[
     Path,
@@ -32,7 +32,9 @@ def _check_folder_name(folder: Path | None) -> Path | None:
     """Raise an InputError for the name of a page in place of a run folder."""
     if folder is not None and folder.suffix.lower() in (".html", ".htm"):
         problem = f"expected the folder of the run, got {folder}"
-        raise InputError("--out", problem, f"For one page with the 3D view, use egvs explore --to {folder}.")
+        raise InputError(
+            "--out", problem, f"For one page with the 3D view, use egvs explore --to {shlex.quote(str(folder))}."
+        )
     return folder
 
 
@@ -175,10 +177,8 @@ def cost(text: str) -> float:
 
 def _check_separators(text: str, option: str) -> None:
     """Raise an InputError where a point or comma can separate thousands or decimals, as in 30.000."""
-    if re.fullmatch(r"[1-9][0-9]{0,2}[.,][0-9]{3}[A-Za-z]*", text):
-        short = re.sub(r"\.?0+(?=[A-Za-z]*$)", "", text.replace(",", "."))
-        choices = f"{short} or {re.sub('[.,]', '', text)}"
-        raise InputError(option, f"{text} can be {choices}", f"Write {choices}.")
+    if choices := ambiguous_number(text):
+        raise InputError(option, f"{text} can mean {choices}", f"Write {choices}.")
 
 
 def width_mm(text: str, least: float, most: float) -> float:
@@ -216,11 +216,13 @@ def radius_m(text: str) -> float:
     return radius
 
 
-def pole_spacing_m(rule: str, spacing: str) -> float:
-    """Return the spacing of ``--poles every 20m`` in metres."""
-    spacing_m = _parse_spacing_m(spacing)
-    if rule != "every" or math.isnan(spacing_m):
-        problem = f"expected every and a length in metres, got {f'{rule} {spacing}'[:80]!r}"
+def pole_spacing_m(text: str) -> float | None:
+    """Return the spacing of ``--poles "every 20m"`` in metres; None for ``existing``."""
+    if text == "existing":
+        return None
+    spacing_m = _parse_quantity(text.removeprefix("every").strip(), {"m": 1.0, "": 1.0})
+    if math.isnan(spacing_m):
+        problem = f"expected existing, or every and a length in metres, got {text[:80]!r}"
         raise InputError("--poles", problem, "Use a spacing such as every 20m.")
     return spacing_m
 
@@ -249,7 +251,7 @@ def _is_number(text: str) -> bool:
 
 
 class NewCommand(PointCommand):
-    """``egvs new``: accepts ``--poles 20m`` and ``--poles "every 20m"`` for ``--poles every 20m``.
+    """``egvs new``: accepts ``--poles every 20m`` in two words.
 
     Its help hides options for recordings where no installed extension reads them.
     """
@@ -264,24 +266,14 @@ class NewCommand(PointCommand):
         super().format_help(ctx, formatter)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Replace a spacing in one word by the two words that the option expects."""
+        """Join a spacing in two words."""
         words: list[str] = []
         for arg in args:
-            option, equals, value = arg.partition("=")
-            if option == "--poles" and equals:
-                words.append(option)
-            elif words[-1:] == ["--poles"]:
-                value = arg
+            if words[-2:] == ["--poles", "every"] or words[-1:] == ["--poles=every"]:
+                words[-1] += f" {arg}"
             else:
                 words.append(arg)
-                continue
-            spacing = value.removeprefix("every ").strip()
-            words += [value] if math.isnan(_parse_spacing_m(spacing)) else ["every", spacing]
         return super().parse_args(ctx, words)
-
-
-def _parse_spacing_m(text: str) -> float:
-    return _parse_quantity(text, {"m": 1.0, "": 1.0})
 
 
 def length_m(text: str, option: str) -> float:

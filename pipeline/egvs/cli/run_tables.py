@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -350,8 +351,9 @@ def print_protections(missing: Sequence[str]) -> None:
 def print_demo_hints(results: Path) -> None:
     """Print what to try after ``egvs demo``."""
     out = console(_RESULT_FILE_WIDTH)
-    out.print(f"next: egvs place {results} --count 2   (the best two sensors together)")
-    out.print(f"      egvs explore {results}   (move a sensor and see its score; needs egvs[explore])")
+    run = shlex.quote(str(results))
+    out.print(f"next: egvs place {run} --count 2   (the best two sensors together)")
+    out.print(f"      egvs explore {run}   (move a sensor and see its score; needs egvs[explore])")
     out.print("      egvs new mytown --from extract.osm.pbf   (your own junction, from OpenStreetMap)")
 
 

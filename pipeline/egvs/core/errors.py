@@ -73,6 +73,13 @@ class InputError(EgvsError):
         return InputError, (self.where, self.problem, self.hint)  # for another process
 
 
+def check_instance(name: str, value: object, kind: type, source: str) -> None:
+    """Raise an InputError if an argument is not of a class; ``source`` is the expression that makes one."""
+    if not isinstance(value, kind):
+        got = f"{type(value).__name__} {value!r}"
+        raise InputError(name, f"expected a {kind.__name__}, got {truncate_text(got)}", f"Use {source}.")
+
+
 class RunError(EgvsError):
     """The input is valid, but the run could not do what it asks for (for example: N vehicles in every frame)."""
 
@@ -321,7 +328,9 @@ def choose_one(name: str, known: Sequence[str]) -> str:
 _MAX_NAMES = 8
 
 
-def unknown_site(where: object, name: str, known: Sequence[str], of: str = "there is") -> InputError:
+def unknown_site(
+    where: object, name: str, known: Sequence[str], of: str = "there is", noun: str = "site"
+) -> InputError:
     """Return the error for an unknown site, with the sites that exist.
 
     Parameters
@@ -334,8 +343,10 @@ def unknown_site(where: object, name: str, known: Sequence[str], of: str = "ther
         The sites.
     of
         Beginning of the sentence, e.g. "this run has".
+    noun
+        "pole or site" where both are meant; then ``known`` are poles.
     """
-    return InputError(where, f"{of} no site {name!r}", choose_one(name, known))
+    return InputError(where, f"{of} no {noun} {name!r}", choose_one(name, known))
 
 
 def _name_similarity(a: str, b: str) -> float:

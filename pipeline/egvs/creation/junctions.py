@@ -271,10 +271,13 @@ class JunctionRegion:
 
 @dataclass(frozen=True)
 class KerbsidePole:
-    """A location for a pole: x, y in metres."""
+    """A location for a pole: x, y in metres; of a pole that exists also its name, how far it was moved, its source."""
 
     x_m: float
     y_m: float
+    name: str = ""
+    moved_m: float = 0.0
+    source: str = ""
 
 
 def read_streets(path: Path) -> Streets:
@@ -533,14 +536,11 @@ def kerbside_poles(
         turns: each adds, of the poles that are nearest to its street, the one nearest to the middle of the junction.
     """
     window = box(*roi.area.buffer(BEYOND_ROI_M, join_style="mitre").bounds)
-    surroundings = window.buffer(_SEARCH_M)
-    pieces = [*streets.areas.values(), *(j.area for j in streets.junctions)]
-    carriageway = shapely.union_all([piece for piece in pieces if piece.intersects(surroundings)])
-
+    carriageway = carriageway_near(streets, window)
     junction_area = shapely.union_all([junction.area, *_approaches(streets, junction, window)]).buffer(1.5 * KERB_M)
-    kerb = _without_islands(carriageway).buffer(KERB_M).boundary
-    kerb = shapely.intersection(kerb, window.intersection(junction_area))
+    kerb = shapely.intersection(kerb_line(carriageway), window.intersection(junction_area))
 
+    surroundings = window.buffer(_SEARCH_M)
     obstacles = [o.buffer(CLEARANCE_M + _TOLERANCE_M) for o in objects if o.intersects(surroundings)]
     forbidden = shapely.union_all([carriageway.buffer(KERB_MIN_M + _TOLERANCE_M), *obstacles])
     shapely.prepare(forbidden)
@@ -555,6 +555,18 @@ def kerbside_poles(
         poles = _take_turns(poles, _arm_areas(streets, junction))[:MAX_POLES]
     poles.sort(key=lambda p: (math.degrees(math.atan2(center.y - p[1], center.x - p[0])), *p))
     return [KerbsidePole(x, y) for x, y in poles]
+
+
+def carriageway_near(streets: Streets, window: BaseGeometry) -> BaseGeometry:
+    """Return the roads and junctions in and around a window."""
+    surroundings = window.buffer(_SEARCH_M)
+    pieces = [*streets.areas.values(), *(j.area for j in streets.junctions)]
+    return shapely.union_all([piece for piece in pieces if piece.intersects(surroundings)])
+
+
+def kerb_line(carriageway: BaseGeometry) -> BaseGeometry:
+    """Return the lines ``KERB_M`` outside a carriageway, on which poles stand; small islands are carriageway."""
+    return _without_islands(carriageway).buffer(KERB_M).boundary
 
 
 def _approaches(streets: Streets, junction: StreetJunction, window: BaseGeometry) -> list[BaseGeometry]:

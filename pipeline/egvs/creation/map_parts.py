@@ -21,7 +21,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.grid import XY, FloatArray, IntArray, Roi
 from egvs.creation import driving_side
 from egvs.creation.junctions import Streets
 from egvs.formats.georeference import HeightUnit, WorldFrame, height_unit, parse_crs
@@ -89,6 +89,25 @@ class MappedSolid:
             properties["radius_m"] = round(self.radius_m, 3)
         properties["height_from"] = self.height_source
         return {"type": "Feature", "properties": properties, "geometry": shapely.geometry.mapping(self.geometry)}
+
+
+@dataclass(frozen=True)
+class MappedPole:
+    """A pole that exists and may carry a sensor.
+
+    Attributes
+    ----------
+    name
+        As of the :class:`MappedSolid`.
+    kind
+        ``lamp``, ``signal`` or ``pole``.
+    at_m
+        x, y in the world frame, as mapped.
+    """
+
+    name: str
+    kind: str
+    at_m: XY
 
 
 @dataclass
@@ -258,6 +277,8 @@ class SolidMap:
     is_base
         Whether it is a map of everything: its buildings give way to those of other maps, and its objects are clear of
         the carriageway already.
+    poles
+        Poles that may carry a sensor, also those on the carriageway.
     """
 
     solids: tuple[MappedSolid, ...] = ()
@@ -267,6 +288,7 @@ class SolidMap:
     notes: tuple[str, ...] = ()
     attribution: str = ""
     is_base: bool = False
+    poles: tuple[MappedPole, ...] = ()
 
     def unseen_shares(self, sensors_m: FloatArray, roi: Roi) -> FloatArray | None:
         """Return the share of each sensor's view that no survey saw, (n,); None if the map is no survey.

@@ -256,6 +256,8 @@ class NewScenarioOptions:
         per hour.
     pole_spacing_m
         Distance between candidate poles along the kerbs; None for a few poles near the junction.
+    existing_poles
+        Whether the candidates are the lamps, signal masts and utility poles of the map instead.
     align
         Two points that place files without a reference system; empty if there are no such files.
     tracks
@@ -282,6 +284,7 @@ class NewScenarioOptions:
     surroundings_m: float | None = None
     traffic: str | int = DEFAULT_TRAFFIC
     pole_spacing_m: float | None = None
+    existing_poles: bool = False
     align: tuple[PointPair, ...] = ()
     tracks: tuple[Path, ...] = ()
     like: tuple[Path, ...] = ()
@@ -396,6 +399,7 @@ class _Draft:
     relief: Relief = field(init=False)
     zones: tuple[Zone, ...] = field(init=False)
     poles: Sequence[KerbsidePole] = field(init=False)
+    known_poles: Sequence[str] | None = None
     plan: RecordingPlan = field(init=False)
     traffic: ScenarioTraffic = field(init=False)
     signal: Signal | None = None
@@ -614,8 +618,19 @@ def _choose_region(draft: _Draft) -> None:
 
 
 def _choose_poles(draft: _Draft) -> None:
-    """Choose locations for poles along the kerbs; InputError where there is none."""
+    """Choose poles of the map, or locations for poles along the kerbs; InputError where there is none."""
     streets, spacing_m = draft.roads.streets, draft.options.pole_spacing_m
+    if draft.options.existing_poles:
+        from egvs.creation import existing_poles
+
+        mapped = [pole for read in draft.maps for pole in read.objects.poles]
+        found = existing_poles.find_existing_poles(mapped, streets, draft.junction, draft.roi, draft.objects.solids)
+        if not found.poles:
+            problem = f"no map has a street lamp, signal mast or utility pole near the {draft.junction.title}"
+            raise InputError("--poles existing", problem, "Leave it out for locations along the kerbs.")
+        draft.poles, draft.known_poles = found.poles, found.as_mapped
+        draft.notes += found.notes
+        return
     draft.poles = junctions.kerbside_poles(streets, draft.junction, draft.roi, draft.objects.areas, spacing_m)
     if not draft.poles:
         has_free_poles = bool(junctions.kerbside_poles(streets, draft.junction, draft.roi, [], spacing_m))
@@ -997,7 +1012,7 @@ def _scenario_toml(draft: _Draft, statics: TomlTable) -> str:
         values = {"name": draft.name} | values
 
     roi_comment, roi = scenario_files.roi_table(draft.roi, draft.relief.z_range_m)
-    sites_comment, sites = scenario_files.sites_table()
+    sites_comment, sites = scenario_files.sites_table(draft.known_poles)
     traffic = {
         "network": NETWORK_FILE,
         "frames": DEFAULT_FRAMES,

@@ -118,8 +118,11 @@ def sites_csv(poles: Sequence[KerbsidePole], columns: Mapping[str, FloatArray] |
         Further columns by name, (n,) each.
     """
     digits = max(2, len(str(len(poles))))
-    rows = [f"k{number:0{digits}d},{pole.x_m},{pole.y_m}" for number, pole in enumerate(poles, 1)]
+    rows = [f"{pole.name or f'k{number:0{digits}d}'},{pole.x_m},{pole.y_m}" for number, pole in enumerate(poles, 1)]
     header = "site,x_m,y_m"
+    if any(pole.source for pole in poles):
+        header += ",source,moved_m"
+        rows = [f"{row},{pole.source},{pole.moved_m:g}" for row, pole in zip(rows, poles, strict=True)]
     for name, values in (columns or {}).items():
         header += f",{name}"
         rows = [f"{row},{value:g}" for row, value in zip(rows, values.tolist(), strict=True)]
@@ -155,11 +158,18 @@ def statics_table(meshes: Sequence[str] = (), terrain: str | None = None) -> Tom
     return comment, keys
 
 
-def sites_table() -> TomlTable:
-    """Return ``[sites]`` without the keys of :func:`mount_keys`."""
+def sites_table(existing: Sequence[str] | None = None) -> TomlTable:
+    """Return ``[sites]`` without the keys of :func:`mount_keys`.
+
+    ``existing`` are the poles whose positions are known where all exist; None for locations along the kerbs.
+    """
     position = "columns longitude, latitude (degrees) work as well as x_m, y_m"
     poles = f"poles {junctions.KERB_M:g} m behind the kerbs of the junction"
-    return f"{poles}; add or remove rows as you like; {position}", {"file": SITES_FILE}
+    keys: dict[str, Any] = {"file": SITES_FILE}
+    if existing is not None:
+        poles = "poles of the map; those that were moved (moved_m) are not among existing_poles before you checked them"
+        keys["existing_poles"] = list(existing)
+    return f"{poles}; add or remove rows as you like; {position}", keys
 
 
 def mount_keys() -> dict[str, Any]:

@@ -16,7 +16,7 @@ All but the empty scan have roads in the background. Labels are placed so that t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any, NamedTuple
@@ -119,13 +119,13 @@ def occupancy(
     """
     scale = scale or MapScale("tpog", float(values.max(initial=0.0)))
     plan, peak = _sites_frame(extent(grid, sites), scale.prefix, style), scale.peak
-    street_names, _ = _street_names(plan, backdrop.roads.names, sites)
+    names, _ = street_names(plan, backdrop.roads.names, [(site.x_m, site.y_m) for site in sites])
     parts = [
         road_paths(plan, backdrop.roads),
         _field_image(plan, grid, values, peak),
         _outline_paths(plan, backdrop.outlines),
         plan.roi(grid),
-        *street_names,
+        *names,
     ]
     for site in sites:
         dot = f'<circle {style.shape("spot")} cx="{plan.x(site.x_m):.1f}" cy="{plan.y(site.y_m):.1f}" r="4"/>'
@@ -151,13 +151,13 @@ def site_map(
     crowded = is_crowded(sites)
     scores = [site.score for site in sites]
     low, high = min(scores), max(scores)
-    street_names, street_boxes = _street_names(plan, backdrop.roads.names, sites)
+    names, street_boxes = street_names(plan, backdrop.roads.names, [(site.x_m, site.y_m) for site in sites])
     radius = 8.5
     labelled = stacks
     if crowded:
         radius = 6.0 if len(stacks) <= 120 else 4.0
         labelled = [*stacks[:10], stacks[-1]]
-    parts = [*base_layers(plan, grid, values, backdrop), *street_names]
+    parts = [*base_layers(plan, grid, values, backdrop), *names]
     parts += [_site_rings(plan, stack, low, high, radius, crowded) for stack in reversed(stacks)]
     parts += _stack_labels(plan, stacks, labelled, radius, [*street_boxes, *_outline_boxes(plan.region(grid))])
     bar = None
@@ -394,16 +394,16 @@ def road_paths(plan: MapFrame, roads: Roads) -> str:
     return f"<g {plan.style.shape('roads')}>{''.join(edges)}{junctions}{''.join(lanes)}</g>"
 
 
-def _street_names(
-    plan: MapFrame, names: Sequence[StreetName], sites: Sequence[RankedSite]
+def street_names(
+    plan: MapFrame, names: Sequence[StreetName], points_m: Iterable[tuple[float, float]]
 ) -> tuple[list[str], list[Box]]:
-    """Street names and the boxes that they cover: within the map, clear of sites and of each other.
+    """Return street names and the boxes that they cover: within the map, clear of points and of each other.
 
     Names on the longest streets come first; a name that finds no room is left out.
     """
     drawn: list[str] = []
     covered: list[Box] = []
-    site_boxes = [_square(plan.x(site.x_m), plan.y(site.y_m), 9.0) for site in sites]
+    point_boxes = [_square(plan.x(x_m), plan.y(y_m), 9.0) for x_m, y_m in dict.fromkeys(points_m)]
     for name in sorted(names, key=lambda name: -name.length_m):
         x0, y0 = plan.x(name.start_m[0]), plan.y(name.start_m[1])
         x1, y1 = plan.x(name.end_m[0]), plan.y(name.end_m[1])
@@ -413,7 +413,7 @@ def _street_names(
             boxes = []
             for offset in np.arange(-half, half, 7):
                 boxes.append(_square(x + offset * math.cos(angle), y + offset * math.sin(angle), 7.0))
-            if all(_is_free(box, plan, [*site_boxes, *covered]) for box in boxes):
+            if all(_is_free(box, plan, [*point_boxes, *covered]) for box in boxes):
                 covered += boxes
                 position = f'transform="translate({x:.1f} {y:.1f}) rotate({math.degrees(angle):.1f})" dy="4"'
                 drawn.append(plan.style.text_with_halo("street", position, name.text))
@@ -656,7 +656,12 @@ def answer_map(
         bar = ColourBar(0.0, 100.0, "Share of vehicles not found (%)", even=True)
     parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid)]
     parts += [f'<path class="view" d="{_closed_path(plan, view_m)}"/>' for view_m in views_m if len(view_m) > 2]
-    for x_m, y_m in dict.fromkeys((site.x_m, site.y_m) for site in candidates):
+    points_m = dict.fromkeys((site.x_m, site.y_m) for site in candidates)
+    names, street_boxes = street_names(
+        plan, backdrop.roads.names, [*points_m, *((pole.x_m, pole.y_m) for pole in poles)]
+    )
+    parts += names
+    for x_m, y_m in points_m:
         parts.append(f'<circle class="spot" cx="{plan.x(x_m):.1f}" cy="{plan.y(y_m):.1f}" r="3"/>')
     spots = []
     for pole in poles:
@@ -665,7 +670,7 @@ def answer_map(
         number = f'<text x="{x:.1f}" y="{y + 4:.1f}">{escape(pole.numbers)}</text>'
         parts.append(f'<g class="planned"><title>{escape(pole.title)}</title>{shape}{number}</g>')
         spots.append(LabelSpot(x, y, pole.label, half))
-    return plan.svg([*parts, *labels(plan, spots, _outline_boxes(plan.region(grid)))], alt, bar)
+    return plan.svg([*parts, *labels(plan, spots, [*street_boxes, *_outline_boxes(plan.region(grid))])], alt, bar)
 
 
 def _share_images(plan: MapFrame, blindspots: SiteBlindspots) -> Iterator[str]:

@@ -13,6 +13,7 @@ import shutil
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from egvs.artefacts import parquet
@@ -30,6 +31,7 @@ from egvs.export.layers import (
     kml_layers,
     run_layers,
 )
+from egvs.results.map_credits import read_map_credits
 
 EXPORT_FOLDER = "export"
 """The default folder for exports, in the run folder."""
@@ -146,6 +148,7 @@ def export_run(
     if file_format.is_one_file:
         _check_not_existing([target], out)
 
+    credits = read_map_credits(run.scenario)
     notes: list[str] = []
     with files.temporary_folder() as temp_folder:
         if file_format.name == "geotiff":
@@ -166,7 +169,7 @@ def export_run(
                 notes += drawing.write_dxf(temp_folder / target.name, run, layers, reference)
                 written = [temp_folder / target.name]
             else:
-                written = list(_write_vectors(file_format, layers, reference, temp_folder, target.name, title))
+                written = list(_write_vectors(file_format, layers, reference, temp_folder, target.name, title, credits))
             progress("files written", 2, 2)
         paths = [target]
         if not file_format.is_one_file:
@@ -175,6 +178,8 @@ def export_run(
         _move_all(written, paths)
     if out is None and not file_format.is_one_file:
         _remove_stale_layers(target, paths)
+    if credits:
+        notes.append(f"name the makers of the map where you show it: {'; '.join(credits)}")
     return ExportResult(tuple(paths), reference.description, tuple(notes))
 
 
@@ -263,7 +268,13 @@ def _remove_stale_layers(folder: Path, paths: Sequence[Path]) -> None:
 
 
 def _write_vectors(
-    file_format: Format, layers: Sequence[Layer], reference: ExportCrs, folder: Path, name: str, title: str
+    file_format: Format,
+    layers: Sequence[Layer],
+    reference: ExportCrs,
+    folder: Path,
+    name: str,
+    title: str,
+    credits: Sequence[str],
 ) -> Iterator[Path]:
     from egvs.export import vector_files
 
@@ -272,11 +283,11 @@ def _write_vectors(
         yield folder / name
         return
     if file_format.name == "kml":
-        vector_files.write_kml(folder / name, title, layers, reference)
+        vector_files.write_kml(folder / name, title, layers, reference, credits)
         yield folder / name
         return
     writers: dict[str, Callable[[Path, Layer, ExportCrs], None]] = {
-        "geojson": vector_files.write_geojson,
+        "geojson": partial(vector_files.write_geojson, credits=credits),
         "geoparquet": vector_files.write_geoparquet,
         "csv": vector_files.write_csv,
     }

@@ -115,7 +115,9 @@ _TITLE_COLUMNS = {
 _ALPHA = {FOOTPRINTS: "a0", REGION: "00"}
 
 
-def write_kml(path: Path, name: str, layers: Sequence[Layer], reference: ExportCrs) -> None:
+def write_kml(
+    path: Path, name: str, layers: Sequence[Layer], reference: ExportCrs, credits: Sequence[str] = ()
+) -> None:
     """Write a document with one folder per layer, and in it one per site if the layer has rows of each site.
 
     Points have their height above the ground as altitude, and z of the world frame in the field ``z_m``.
@@ -130,10 +132,14 @@ def write_kml(path: Path, name: str, layers: Sequence[Layer], reference: ExportC
         The layers.
     reference
         The reference system, in degrees.
+    credits
+        The makers of the maps.
     """
     root = ET.Element("kml", xmlns=_NAMESPACE)
     document = ET.SubElement(root, "Document")
     ET.SubElement(document, "name").text = _remove_invalid_xml(name)
+    if credits:
+        ET.SubElement(document, "description").text = f"Map data {_remove_invalid_xml('; '.join(credits))}"
     styles: dict[str, ET.Element] = {}
     for layer in layers:
         layer_folder = _folder(document, layer.name)
@@ -243,14 +249,16 @@ def _remove_invalid_xml(text: str) -> str:
     return _INVALID_XML.sub("", text)
 
 
-def write_geojson(path: Path, layer: Layer, reference: ExportCrs) -> None:
-    """Write a layer as a FeatureCollection."""
+def write_geojson(path: Path, layer: Layer, reference: ExportCrs, credits: Sequence[str] = ()) -> None:
+    """Write a layer as a FeatureCollection, with whom the licences of the maps require to be named."""
     import shapely
 
     shapes = reference.geometries(layer.geometries)
     if reference.is_degrees:
         shapes = shapely.orient_polygons(shapes)  # counter-clockwise, as RFC 7946 requires
     document: dict[str, Any] = {"type": "FeatureCollection", "name": layer.name}
+    if credits:
+        document["attribution"] = "; ".join(credits)
     if reference.is_local:
         document["crs"] = None
     elif not reference.is_degrees:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,11 @@ LOCK_WAIT_S = 60.0
 
 
 def add_to_report(
-    folder: Path, file: RunFile, values: Mapping[str, Mapping[str, Any]], stages: Iterable[str] | None = None
+    folder: Path,
+    file: RunFile,
+    values: Mapping[str, Mapping[str, Any]],
+    stages: Iterable[str] | None = None,
+    removed: Collection[str] = (),
 ) -> tuple[Path, ...]:
     """Write the results of a command into a run folder, and draw its report again.
 
@@ -31,6 +35,8 @@ def add_to_report(
         JSON values of each entry, by its name.
     stages
         Stages that the results depend on; all recorded ones but the report when None.
+    removed
+        Names of entries of the file that no longer hold.
 
     Returns
     -------
@@ -49,6 +55,6 @@ def add_to_report(
         names = [name for name in recorded if not stage(name).is_view] if stages is None else list(stages)
         inputs = {name: recorded[name].inputs for name in names}
         path = folder / file.name
-        write_results(path, {name: CommandResult(inputs, entry) for name, entry in values.items()})
+        write_results(path, {name: CommandResult(inputs, entry) for name, entry in values.items()}, removed)
         report = refresh_report(RunFolder(folder).path)
     return (path,) if report is None else (path, report)

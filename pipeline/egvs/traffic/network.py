@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -645,7 +646,7 @@ def check_is_no_map(path: Path) -> None:
     """Raise an InputError for a map of a format that ``egvs new`` makes networks of."""
     state = path.stat()
     if _is_map(path, state.st_mtime_ns, state.st_size):
-        hint = f"Run egvs new NAME --from {path.name}, which makes a scenario with a network of it."
+        hint = f"Run egvs new NAME --from {shlex.quote(path.name)}, which makes a scenario with a network of it."
         raise InputError(path, "expected a SUMO network, got a map", hint)
 
 

@@ -17,7 +17,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core.errors import InputError
 from egvs.creation import junctions, road_levels
 from egvs.creation.junctions import StreetJunction, Streets
-from egvs.creation.map_parts import ImportCounts, MapContext, MappedSolid, RoadOptions, SolidMap
+from egvs.creation.map_parts import ImportCounts, MapContext, MappedPole, MappedSolid, RoadOptions, SolidMap
 from egvs.creation.openstreetmap import ATTRIBUTION, elevation
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
@@ -158,7 +158,8 @@ class OsmRoads:
     def solids(self, window: BaseGeometry) -> SolidMap:
         """Return the static objects in a window (world frame, metres), bridges over the junction included."""
         solids, counts = osm_solids.map_solids(self.extract, self.streets, self.others.decks, window)
-        return SolidMap(tuple(solids), counts=counts, attribution=ATTRIBUTION, is_base=True)
+        poles = osm_solids.carrying_poles(self.extract, self.streets, window)
+        return SolidMap(tuple(solids), counts=counts, attribution=ATTRIBUTION, is_base=True, poles=poles)
 
 
 def open_roads(path: Path, options: RoadOptions) -> OsmRoads:
@@ -173,11 +174,12 @@ def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
         problem = "the extract is in degrees, but the road map has no reference system"
         raise InputError(paths[0], problem, "Use a road map with a reference system.")
     solids: list[MappedSolid] = []
+    poles: list[MappedPole] = []
     counts = ImportCounts()
     for path in paths:
-        of_file, counts_of_file = osm_solids.map_solids(
-            osm_files.read_osm(path), context.streets, window=context.window
-        )  # fmt: skip
+        extract = osm_files.read_osm(path)
+        of_file, counts_of_file = osm_solids.map_solids(extract, context.streets, window=context.window)
         solids += of_file
+        poles += osm_solids.carrying_poles(extract, context.streets, context.window)
         counts = counts.plus(counts_of_file)
-    return SolidMap(tuple(solids), counts=counts, attribution=ATTRIBUTION, is_base=True)
+    return SolidMap(tuple(solids), counts=counts, attribution=ATTRIBUTION, is_base=True, poles=tuple(poles))

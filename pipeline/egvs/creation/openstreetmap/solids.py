@@ -30,7 +30,7 @@ from egvs.core.grid import XY
 from egvs.core.polygons import PairCount, check_corners, check_crossings, repair_polygon
 from egvs.creation.carriageway import clear_of_carriageway, geometry_pieces, lanes_under, large_pieces
 from egvs.creation.junctions import Streets
-from egvs.creation.map_parts import DECK_BASE_M, DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedSolid
+from egvs.creation.map_parts import DECK_BASE_M, DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedPole, MappedSolid
 from egvs.creation.openstreetmap.street_network import PATH_HIGHWAYS
 from egvs.formats.osm import OsmExtract, Relation, Tags, Way, parse_number
 from egvs.world import map_features
@@ -50,6 +50,12 @@ _DECK_LANE_M, _DECK_EDGE_M, _TRACK_M, _PATH_M = 3.5, 1.0, 5.0, 3.0
 
 _SOLID_TYPES = SolidTypes()
 _BUILDING_KEYS = ("building:part", "building", "man_made")
+
+CARRYING_POLES = {
+    "highway.street_lamp": "lamp", "highway.traffic_signals": "signal", "man_made.utility_pole": "pole",
+    "power.pole": "pole",
+}  # fmt: skip
+"""Poles that may carry a sensor, with the kind that candidates are named after."""
 
 _MAX_LANES = 12
 
@@ -406,6 +412,17 @@ def find_poles(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) -> 
             counts.not_modelled[f"barrier={tags['barrier']}"] += 1
         elif tags.get("power") in ("tower", "portal"):
             counts.not_modelled[f"power={tags['power']}"] += 1
+
+
+def carrying_poles(extract: OsmExtract, streets: Streets, window: BaseGeometry | None) -> tuple[MappedPole, ...]:
+    """Return the poles of :data:`CARRYING_POLES` in a window (world frame); parameters as of :func:`map_solids`."""
+    xy = streets.node_positions(extract.nodes)
+    poles = []
+    for node, tags in extract.node_tags.items():
+        kinds = [CARRYING_POLES[f"{key}.{value}"] for key, value in tags.items() if f"{key}.{value}" in CARRYING_POLES]
+        if kinds and (window is None or window.covers(point_at(xy[node]))):
+            poles.append(MappedPole(f"node/{node}", kinds[0], xy[node]))
+    return tuple(poles)
 
 
 def _pole_type(tags: Tags) -> SolidType | None:

@@ -14,6 +14,7 @@ problem, Operations Research 27, 1979).
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -203,9 +204,9 @@ def check_additive_config(scenario: Scenario) -> None:
     for key in ("zones", "survives", "objective", "reach", "refine", "budget", "count"):
         if getattr(config, key) != getattr(default, key):
             raise InputError(
-                f"{scenario.file}: placement.{key}",
+                scenario.locate(f"placement.{key}"),
                 "has no effect in a city, where joint scores are summed and one count or budget is shared",
-                f"Remove the key, or use egvs place {scenario.folder}.",
+                f"Remove the key, or use {shlex.join(['egvs', 'place', str(scenario.folder)])}.",
             )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 
 from egvs.cli.console import WIDE, Column, console, make_table
@@ -26,7 +27,7 @@ def print_new_city(city: NewCity) -> None:
     for note in city.notes:
         out.print(f"note: {note}")
     out.print(f"Map data {ATTRIBUTION}")
-    out.print(f"next: egvs city run {city.folder}")
+    out.print(f"next: {shlex.join(['egvs', 'city', 'run', str(city.folder)])}")
 
 
 def _city_lines(city: NewCity) -> Iterator[tuple[str, str]]:

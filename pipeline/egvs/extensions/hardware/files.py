@@ -14,6 +14,9 @@ SENSOR_DESIGN = RunFile("sensor_design.json", "sensor design")
 SHEETS = RunFile("sheets.json", "sheets")
 ACCEPTANCE = RunFile("acceptance.json", "accept")
 
+PLANNED_KEY = "planned"
+"""Key of the entry of a sheet: whether the site was part of the plan."""
+
 FILES = (SENSOR_DESIGN, SHEETS, ACCEPTANCE)
 """All files; the entry point of the group ``egvs.files``."""
 

@@ -25,7 +25,8 @@ def sheets(
         list[str] | None,
         typer.Option(
             metavar="SITE",
-            help="A site (repeatable); by default the sensors of the plan in the folder, or the best site without one.",
+            help="A site, or a pole (its site in the plan, else its best one); repeatable. By default the sensors of"
+            " the plan in the folder, or the best site without one.",
         ),
     ] = None,
     kind: Annotated[str, typer.Option("--format", metavar="FORMAT", help="pdf or svg.")] = "pdf",
@@ -39,14 +40,17 @@ def sheets(
     with ProgressDisplay("sheets") as screen:
         from egvs.extensions.hardware.installation import sheet, tolerances
 
-        written = sheet.write_sheets(run, site or (), kind=kind, out=out, progress=screen.progress)
+        notes: list[str] = []
+        written = sheet.write_sheets(
+            run, site or (), kind=kind, out=out, progress=screen.progress, on_note=notes.append
+        )  # fmt: skip
     sentences = []
     for data, _ in written:
         angles = f"bearing {sheet.format_angle(data.grid_bearing_deg)} from grid north"
         height = f"{data.mounting_height_m:.2f} m above the ground"
         costs = tolerances.describe_tolerances(data.tolerances)
         sentences.append(f"{data.site.name}: {height}, {angles}; {costs} ({data.tolerances.frames:,} frames).")
-    print_sentences(sentences)
+    print_sentences([*sentences, *notes])
     for _, path in written:
         print(path)
 
@@ -61,7 +65,7 @@ def accept(
             " .laz, .csv, .e57 or .npz. Several scans, minutes apart: --scan A --scan B --scan C.",
         ),
     ] = None,
-    site: Annotated[str, typer.Option(metavar="SITE", help="Required: the site where the sensor is installed.")] = "",
+    site: Annotated[str, typer.Option(metavar="SITE", help="Required: the site, or the pole, of the sensor.")] = "",
     position: Annotated[
         float, typer.Option(metavar="M", min=0, help="Largest error of the position.")
     ] = _LIMITS.position_m,

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
-from egvs.extensions.hardware.files import ACCEPTANCE, FILES, SENSOR_DESIGN, SHEETS, design_digest
+from egvs.extensions.hardware.files import ACCEPTANCE, FILES, PLANNED_KEY, SENSOR_DESIGN, SHEETS, design_digest
 from egvs.report.extension_sections import SectionWarning
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.ranking import RankedSite
+from egvs.results.ranking import RankedSite, describe_roll
 from egvs.results.sensors import ScoreDifference
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
@@ -97,11 +97,10 @@ class HardwareResults:
         from egvs.results.command_entries import current_entries
 
         designs = current_entries(folder / SENSOR_DESIGN.name, stages, lambda _: design_digest(scenario))
-        sheets = current_entries(folder / SHEETS.name, stages)
+        sheets = current_sheets(folder, stages) if (folder / SHEETS.name).is_file() else {}
         checks = current_entries(folder / ACCEPTANCE.name, stages)
-        if sheets or checks:
-            poses = _present_poses(folder, stages)
-            sheets, checks = _at_present_poses(sheets, poses), _at_present_poses(checks, poses)
+        if checks:
+            checks = _at_present_poses(checks, _present_poses(folder, stages)[0])
         if not (designs or sheets or checks):
             return None
         return cls(
@@ -114,15 +113,25 @@ class HardwareResults:
         )
 
 
-def _present_poses(folder: RunFolder, stages: Mapping[str, StageRecord]) -> dict[str, Pose]:
-    """Return the poses of the sites of a run; a site of its plan has the planned one."""
+def current_sheets(folder: RunFolder, stages: Mapping[str, StageRecord]) -> Entries:
+    """Return the entries of the sheets that belong to the run and to its plan."""
+    from egvs.results.command_entries import current_entries
+
+    poses, planned = _present_poses(folder, stages)
+    entries = _at_present_poses(current_entries(folder / SHEETS.name, stages), poses)
+    return {name: values for name, values in entries.items() if name in planned or not values.get(PLANNED_KEY)}
+
+
+def _present_poses(folder: RunFolder, stages: Mapping[str, StageRecord]) -> tuple[dict[str, Pose], set[str]]:
+    """Return the poses of the sites of a run, and which of them its plan has: these have the planned pose."""
     from egvs.results.plans import SensorPlan
 
     poses = {site.site: site.pose for site in RankedSite.read(folder.scores)}
     plan = SensorPlan.read(folder)
+    planned = {}
     if plan is not None and plan.belongs_to(stages):
-        poses |= {sensor.mount.name: sensor.mount.pose for sensor in plan.sensors}
-    return poses
+        planned = {sensor.site: sensor.mount.pose for sensor in plan.sensors}
+    return poses | planned, set(planned)
 
 
 def _at_present_poses(entries: Entries, poses: Mapping[str, Pose]) -> Entries:
@@ -168,10 +177,12 @@ def _design_table(pole: str, values: Mapping[str, Any]) -> DesignTable:
             gain += f" ± {100 * difference.se:.1f}"
         if difference.value and not difference.is_clear:
             gain = f"~ {gain}"
+        roll = describe_roll(design.get("roll_deg", 0.0))
         se = math.nan if design["se"] is None else design["se"]
         rows.append(
             DesignRow(
-                design["sensor"], f"{design['height_m']:.2f}", f"{design['yaw_deg']:.1f}",
+                f"{design['sensor']}, {roll}" if roll else design["sensor"],
+                f"{design['height_m']:.2f}", f"{design['yaw_deg']:.1f}",
                 f"{design['pitch_deg']:z.1f}", label.value(design["search_score"]),
                 label.with_error(design["score"], se), gain, design["chosen"],
             )

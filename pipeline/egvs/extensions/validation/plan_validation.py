@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -253,7 +254,7 @@ def read_fused_plan(folder: Path, scenario: Scenario) -> FusedPlan:
         raise InputError(
             path,
             "no such file: the folder contains no plan",
-            f"Run egvs place {scenario.name} --count 3, or name the folder of another run with --plan-from.",
+            f"Run egvs place {shlex.quote(scenario.name)} --count 3, or name another run's folder with --plan-from.",
         )
     checksums.verify_checksums(path.with_name(RunFolder.placement_checksums.name), "Run egvs place again.")
     table, metadata = parquet.read_artefact(path, "placement")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
+import shlex
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 
 import egvs
+from egvs.export.export import export_run
 from egvs.extensions.hardware.installation import sheet, view
 from egvs.extensions.hardware.installation.planned_sites import PlannedSites
 from egvs.extensions.hardware.installation.tolerances import QUANTITIES, Tolerance
@@ -148,9 +151,78 @@ def test_default_is_the_plan_and_command_prints_tolerances(located: Path, run_eg
     assert "(40 frames)" in printed
 
 
+@pytest.fixture(scope="module")
+def spaced(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with two mounts on each of two poles whose names have a space, of a map with a maker, with a plan."""
+    folder = tmp_path_factory.mktemp("spaced")
+    scenario = write_installed_scenario(folder / "crossing")
+    file = scenario / "scenario.toml"
+    file.write_text(file.read_text().replace("[sites]", "[sites]\nheights_m = [4, 5]", 1))
+    rows = "Ampel Nord,10,12,-60,-5\nMast West,30.5,-12,90,0\n"
+    (scenario / "sites.csv").write_text(f"site,x_m,y_m,yaw_deg,pitch_deg\n{rows}")
+    solids = scenario / "statics.geojson"
+    head = '{"attribution": "(c) OpenStreetMap contributors, ODbL",'
+    solids.write_text(solids.read_text().replace("{", head, 1))
+    loaded = egvs.load(scenario, ["placement.count=2", "placement.most_per_pole=1"])
+    egvs.run(loaded, folder / "run", jobs=1)
+    egvs.place(loaded, folder / "run")
+    return folder / "run"
+
+
+def sheet_text(path: Path) -> str:
+    root = ET.fromstring(path.read_text(encoding="utf-8"))
+    return " ".join(element.text or "" for element in root.iter("{http://www.w3.org/2000/svg}text"))
+
+
+def test_sheets_of_a_dropped_mast_are_removed(spaced: Path, run_egvs: Any, tmp_path: Path) -> None:
+    """A crew that finds an old sheet would mount what is no longer planned. A sheet that somebody changed stays."""
+    scenario = spaced.parent / "crossing"
+    run_egvs("sheets", spaced, "--format", "svg")
+    both = {path.name for path in (spaced / "sheets").iterdir()}
+    assert len(both) == 2
+    (spaced / "sheets" / "notes.txt").write_text("ours")
+    egvs.place(egvs.load(scenario, ["placement.excluded=['Mast West']", "placement.count=1"]), spaced)
+    assert "installation_Mast_West" not in (spaced / "report.html").read_text()
+    code, printed, _ = run_egvs("sheets", spaced, "--format", "svg")
+    (kept,) = {name for name in both if "Ampel" in name}
+    (dropped,) = both - {kept}
+    assert (code, {path.name for path in (spaced / "sheets").iterdir()}) == (0, {kept, "notes.txt"})
+    assert f"removed, because they were of an earlier plan: {dropped}." in " ".join(printed.split())
+
+    (spaced / "sheets" / kept).write_text("<svg>with a note</svg>")
+    egvs.place(egvs.load(scenario, ["placement.excluded=['Ampel Nord']", "placement.count=1"]), spaced)
+    code, printed, _ = run_egvs("sheets", spaced, "--format", "svg")
+    assert (code, (spaced / "sheets" / kept).is_file()) == (0, True)
+    assert "of an earlier plan, but changed since" in printed
+    egvs.place(egvs.load(scenario, ["placement.count=2", "placement.most_per_pole=1"]), spaced)
+
+
+def test_sheet_of_a_candidate_stays_beside_others_of_the_run(spaced: Path, tmp_path: Path) -> None:
+    for height in (4, 5):
+        sheet.write_sheets(spaced, [f"Mast West@{height}m"], kind="svg", out=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_site_may_be_a_pole(spaced: Path, run_egvs: Any, tmp_path: Path) -> None:
+    planned = next(name for name in PlannedSites.open(spaced).plan if name.startswith("Ampel Nord@"))
+    code, printed, _ = run_egvs("sheets", spaced, "--site", "Ampel Nord", "--format", "svg", "--out", tmp_path)
+    assert (code, printed.startswith(planned)) == (0, True)
+
+
+def test_command_is_quoted_and_maker_of_map_is_named(spaced: Path, tmp_path: Path) -> None:
+    ((data, path),) = sheet.write_sheets(spaced, ["Mast West"], kind="svg", out=tmp_path)
+    words = shlex.split(re.search("egvs accept .*? measured.pcd", sheet_text(path))[0])  # type: ignore[index]
+    assert words == ["egvs", "accept", "RUN", "--site", data.site.name, "--scan", "measured.pcd"]
+    assert "Map data (c) OpenStreetMap contributors, ODbL" in sheet_text(path)
+    assert "Orange: the sensor, its field of view (30 m of 100 m) and its front (arrow)" in sheet_text(path)
+    (exported, *_), notes = (result := export_run(spaced, "geojson", out=tmp_path / "geojson")).paths, result.notes
+    assert json.loads(exported.read_text())["attribution"] == "(c) OpenStreetMap contributors, ODbL"
+    assert any("OpenStreetMap contributors" in note for note in notes)
+
+
 def test_rejects_unknown_site_and_format(installed: InstalledRun, run_egvs: Any, tmp_path: Path) -> None:
     for words, message in (
-        (("--site", "pole_a", "--site", "nowhere"), "no site 'nowhere'. Choose one of pole_a, pole_b."),
+        (("--site", "pole_a", "--site", "nowhere"), "no pole or site 'nowhere'. Choose one of pole_a, pole_b."),
         (("--format", "gif"), "--format: expected one of pdf, svg, got 'gif'"),
     ):
         code, _, errors = run_egvs("sheets", installed.folder, *words, "--out", tmp_path / "out")

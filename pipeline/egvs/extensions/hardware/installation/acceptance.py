@@ -328,7 +328,7 @@ def accept(
     limits = limits or Limits()
     steps = 4
     planned_sites = PlannedSites.open(Path(run))
-    planned = planned_sites.site(site)
+    planned = planned_sites.site(planned_sites.resolve(site))
     sensor = planned_sites.sensor(planned)
     sweeps = sweep_files.read_sweeps([Path(scan) for scan in scans])
     clouds = [sweep.points_m[np.isfinite(sweep.points_m[:, 0])] for sweep in sweeps]

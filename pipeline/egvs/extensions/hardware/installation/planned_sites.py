@@ -10,6 +10,7 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.core.errors import InputError, unknown_site
 from egvs.explore.session import Session
 from egvs.export.finished_run import FinishedRun
+from egvs.results.map_credits import read_map_credits
 from egvs.results.plans import SensorPlan
 from egvs.sensors import site_feasibility
 from egvs.sensors.sensor import Sensor
@@ -56,6 +57,27 @@ class PlannedSites:
             raise InputError(folder.placement, problem, "Run egvs place again, or remove the file.")
         return {sensor.site: sensor.mount.pose for sensor in plan.sensors}
 
+    def resolve(self, name: str) -> str:
+        """Return the site that is meant by the name of a site or a pole: of a pole that of the plan, or its best.
+
+        Raises
+        ------
+        InputError
+            If there is neither such a site nor such a pole, or the plan has several sensors on the pole.
+        """
+        candidates = self.session.candidates
+        if name in candidates:
+            return name
+        on_pole = [candidate.site.name for candidate in self.session.ranked if candidate.site.pole == name]
+        planned = [site for site in self.plan if site in on_pole]
+        if len(planned) > 1:
+            problem = f"the plan has {len(planned)} sensors on pole {name!r}"
+            raise InputError("--site", problem, f"Choose one of {', '.join(planned)}.")
+        if on_pole:
+            return (planned or on_pole)[0]
+        poles = dict.fromkeys(candidate.site.pole for candidate in candidates.values())
+        raise unknown_site("--site", name, list(poles), "this run has", noun="pole or site")
+
     def site(self, name: str) -> Site:
         """Return a candidate by its name, at its pose in the plan if it is part of the plan.
 
@@ -74,6 +96,11 @@ class PlannedSites:
             raise unknown_site("--site", name, list(candidates), "this run has")
         site = candidates[name].site
         return replace(site, pose=self.plan.get(name, site.pose))
+
+    @cached_property
+    def map_credits(self) -> tuple[str, ...]:
+        """Who made the maps of the scenario, each as "Map data (c) OpenStreetMap contributors"."""
+        return tuple(f"Map data {credit}" for credit in read_map_credits(self.run.scenario))
 
     def sensor(self, site: Site) -> Sensor:
         """Return the sensor of a site."""

@@ -11,8 +11,10 @@ east of true north. It is computed from the direction in which the latitude grow
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Sequence
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from html import escape
@@ -35,10 +37,11 @@ from egvs.drawing.svg_figures import Box, FigureStyle, MapFrame, svg_start_tag
 from egvs.export.export import safe_file_name
 from egvs.export.figure import convert_svg
 from egvs.export.finished_run import SCENARIO_CRS, ExportCrs
-from egvs.extensions.hardware.files import SHEETS
+from egvs.extensions.hardware.files import PLANNED_KEY, SHEETS
 from egvs.extensions.hardware.installation import tolerances, view
 from egvs.extensions.hardware.installation.planned_sites import PlannedSites, path_in_run
 from egvs.extensions.hardware.installation.tolerances import PoseTolerances, Tolerance
+from egvs.extensions.hardware.report_section import current_sheets
 from egvs.formats import georeference
 from egvs.formats.georeference import WorldFrame
 from egvs.results.labels import SCORE_LABELS, format_degrees
@@ -49,12 +52,19 @@ from egvs.sensors.sites import Pose, Site, grid_bearing_deg
 FILE_TYPES = ("pdf", "svg")
 SHEETS_FOLDER = "sheets"
 
+_DIGEST_KEY = "sha256"
 _LATITUDE_STEP_DEG = 1e-3
 _PAGE_MM = (210.0, 297.0)
 _STYLE = FigureStyle.for_print(_PAGE_MM[0])
 _MARGIN = 70.0
+_VIEW_M = 30.0
+"""The map shows the field of view at most to this distance."""
 _MAP_M = 45.0
 """The map shows the region of interest, and at least this far around the sensor."""
+
+
+def _ignore_note(note: str) -> None:
+    """Ignore a note."""
 
 
 @dataclass(frozen=True)
@@ -255,21 +265,27 @@ def write_sheets(
     kind: str = "pdf",
     out: Path | None = None,
     progress: ProgressCallback = no_progress,
+    on_note: Callable[[str], None] = _ignore_note,
 ) -> list[tuple[SheetData, Path]]:
     """Write an installation sheet for each site, and add what they say to the report of the run.
+
+    Sheets of an earlier plan are removed.
 
     Parameters
     ----------
     run
         Folder of a finished run.
     sites
-        Names of sites; by default those of the plan in the folder, or the best site without a plan.
+        Names of sites, or of poles for their site in the plan or else their best one; by default those of the plan in
+        the folder, or the best site without a plan.
     kind
         One of :data:`FILE_TYPES`.
     out
         Folder to write; ``sheets`` in the run folder by default.
     progress
         Called after each sheet.
+    on_note
+        Called with a sentence on the sheets of an earlier plan.
 
     Returns
     -------
@@ -288,9 +304,7 @@ def write_sheets(
     planned = PlannedSites.open(Path(run))
     run_folder = planned.run.work.folder
     read_results(run_folder / SHEETS.name)
-    names = tuple(dict.fromkeys(sites)) or planned.default_sites
-    for name in names:
-        planned.site(name)
+    names = tuple(dict.fromkeys(map(planned.resolve, sites))) or planned.default_sites
     folder = out or run_folder.path / SHEETS_FOLDER
     paths = [folder / f"installation_{safe_file_name(name)}.{kind}" for name in names]
     for path in paths:
@@ -303,9 +317,48 @@ def write_sheets(
             partial.write_bytes(convert_svg(f"{svg}\n", kind))
         written.append((data, path))
         progress("sheets", number, len(names))
-    entries = {data.site.name: _report_entry(data, path, run_folder) for data, path in written}
-    add_to_report(run_folder.path, SHEETS, entries)
+    entries = {}
+    for data, path in written:
+        entries[data.site.name] = {
+            **_report_entry(data, path, run_folder), PLANNED_KEY: data.site.name in planned.plan,
+        }  # fmt: skip
+    outdated = _outdated_sheets(planned, entries)
+    add_to_report(run_folder.path, SHEETS, entries, removed=outdated.keys())
+    for note in _remove_sheets(outdated, run_folder, folder, [path for _, path in written]):
+        on_note(note)
     return written
+
+
+def _outdated_sheets(planned: PlannedSites, entries: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """Return the earlier entries that are not of this run and plan, or that new ones replace."""
+    folder = planned.run.work.folder
+    current = current_sheets(folder, planned.run.record.stages)
+    earlier = {name: result.values for name, result in read_results(folder / SHEETS.name).items()}
+    return {name: values for name, values in earlier.items() if name in entries or name not in current}
+
+
+def _remove_sheets(
+    outdated: Mapping[str, Mapping[str, Any]], run_folder: RunFolder, folder: Path, written: Sequence[Path]
+) -> Iterator[str]:
+    """Remove the files of entries that are not among the ``written`` ones; a file that somebody changed stays."""
+    removed, changed = [], []
+    for values in outdated.values():
+        path = run_folder.path / values["path"] if values["path"] else folder / values["file"]
+        if path in written or not path.is_file() or path.is_symlink():
+            continue
+        if _digest(path) == values.get(_DIGEST_KEY):
+            path.unlink()
+            removed.append(path.name)
+        elif values["path"]:
+            changed.append(str(path))
+    if removed:
+        yield f"removed, because they were of an earlier plan: {', '.join(removed)}."
+    if changed:
+        yield f"of an earlier plan, but changed since: {', '.join(changed)}. Remove them, or rename them."
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _report_entry(data: SheetData, path: Path, folder: RunFolder) -> dict[str, Any]:
@@ -319,6 +372,7 @@ def _report_entry(data: SheetData, path: Path, folder: RunFolder) -> dict[str, A
         "frames": data.tolerances.frames,
         "file": path.name,
         "path": path_in_run(path, folder),
+        _DIGEST_KEY: _digest(path),
     }
 
 
@@ -343,6 +397,8 @@ def draw_sheet(planned: PlannedSites, data: SheetData) -> str:
     map_left = _MARGIN + column + 0.04 * inner
     map_width = inner - column - 0.04 * inner
     parts.append(f'<g transform="translate({map_left:.1f} 140)">{_draw_map(planned, data, map_width)}</g>')
+    legend = f"Orange: the sensor, its field of view{_describe_radius(data)} and its front (arrow)"
+    parts.append(_text(map_left, 536, legend, 11, colour="#4a5262"))
 
     top = max(below, 560.0) + 30
     picture_height = inner / 2.0
@@ -357,10 +413,10 @@ def draw_sheet(planned: PlannedSites, data: SheetData) -> str:
     )
     top += picture_height + 50
     _tolerance_table(parts, data.tolerances, top, inner)
-    check = f"After mounting: egvs accept RUN --site {data.site.name} --scan measured.pcd"
+    check = f"After mounting: egvs accept RUN --site {shlex.quote(data.site.name)} --scan measured.pcd"
     parts.append(_text(_MARGIN, height - 70, check, 13))
-    note = f"egvs {__version__} · Bearings are clockwise from north; the front of the sensor is its x axis."
-    parts.append(_text(_MARGIN, height - 45, note, 11, colour="#4a5262"))
+    notes = ["Bearings are clockwise from north; the front of the sensor is its x axis.", *planned.map_credits]
+    parts.append(_text(_MARGIN, height - 45, " · ".join([f"egvs {__version__}", *notes]), 11, colour="#4a5262"))
     return "\n".join([*parts, "</svg>"])
 
 
@@ -435,6 +491,11 @@ def describe_losses(tolerance: Tolerance) -> str:
     return f"{', '.join(texts)} points"
 
 
+def _describe_radius(data: SheetData) -> str:
+    """Return that the field of view ends earlier on the map than in the world; empty otherwise."""
+    return f" ({_VIEW_M:g} m of {data.sensor.range_m:g} m)" if data.sensor.range_m > _VIEW_M else ""
+
+
 def _draw_map(planned: PlannedSites, data: SheetData, width: float) -> str:
     """Return a map around the sensor with its field of view, as shapes in a frame that starts at 0, 0."""
     work = planned.run.work
@@ -443,7 +504,8 @@ def _draw_map(planned: PlannedSites, data: SheetData, width: float) -> str:
     backdrop = Backdrop(world_outlines(work.world, box), roads_within(network_file(work.folder.path), box))
     plan = MapFrame(box, "sheet", width=width, tallest=380.0, north=True, style=_STYLE)
     values = tpog.counts.sum(axis=2) / tpog.frames
-    parts = [*maps.base_layers(plan, tpog.grid, values, backdrop), _field_of_view(plan, data)]
+    names, _ = maps.street_names(plan, backdrop.roads.names, [(data.pose.x_m, data.pose.y_m)])
+    parts = [*maps.base_layers(plan, tpog.grid, values, backdrop), _field_of_view(plan, data), *names]
     x, y = plan.x(data.pose.x_m), plan.y(data.pose.y_m)
     parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="6" fill="#e8590c" stroke="#fff" stroke-width="1.5"/>')
     figure = plan.svg(parts, f"Map around {data.site.name} with its field of view.")
@@ -461,7 +523,7 @@ def _map_box(tpog: Tpog, pose: Pose) -> Box:
 def _field_of_view(plan: MapFrame, data: SheetData) -> str:
     """Return the field of view as a sector, or a circle, and an arrow along the front."""
     pose, span = data.pose, data.sensor.azimuth_span_deg
-    radius_m = min(data.sensor.range_m, 30.0)
+    radius_m = min(data.sensor.range_m, _VIEW_M)
     first, last = (0.0, 360.0) if span is None else span
     angles = np.radians(np.linspace(pose.yaw_deg + first, pose.yaw_deg + last, 73))
     rim = [(pose.x_m + radius_m * math.cos(angle), pose.y_m + radius_m * math.sin(angle)) for angle in angles.tolist()]
