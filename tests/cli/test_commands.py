@@ -111,3 +111,11 @@ def test_comparison_of_traffic_needs_the_extension(
 def test_table_of_shipped_commands_is_complete() -> None:
     for extension in plugins.plugin_names(commands.GROUP):
         assert sorted(commands.extension_commands(extension)) == sorted(commands.SHIPPED[extension])
+
+
+def test_check_names_sensors_that_hang_upside_down(mini: Path, run_egvs: Any) -> None:
+    assert "upside down" not in run_egvs("check", mini)[1]
+    code, printed, error = run_egvs("check", mini, "--set", "sensors.small.mount=inverted")
+    assert code == 0, error
+    sites = len((mini / "sites.csv").read_text().splitlines()) - 1
+    assert f"small hangs upside down at {sites} of {sites} sites" in printed

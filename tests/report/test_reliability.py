@@ -53,6 +53,13 @@ def test_says_that_larger_tilts_were_not_validated(pitch_deg: float, is_tilted: 
     ]
 
 
+@pytest.mark.parametrize(("roll_deg", "is_tilted"), [(180.0, False), (-178.0, False), (170.0, True), (10.0, True)])
+def test_upside_down_is_no_tilt(roll_deg: float, is_tilted: bool) -> None:
+    ranking = ranked(("a", 3, 0, 9.0), ("b", 3, 0, 5.0))
+    hung = replace(ranking, sites=tuple(replace(site, roll_deg=roll_deg) for site in ranking.sites))
+    assert any("The tilt of" in sentence for sentence in describe_reliability(hung)) == is_tilted
+
+
 def test_size_of_expected_detections_was_validated_less_than_its_order() -> None:
     (sentence,) = describe_reliability(ranked(("a", 3, 0, 0.9), ("b", 3, 0, 0.5), rank_by="expected_detections"))
     assert "better than its size" in sentence and "±" not in sentence

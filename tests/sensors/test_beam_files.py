@@ -31,6 +31,7 @@ from egvs.stages.inputs import CheckInputs
 from egvs.stages.site_scans import empty_scans
 from tests.clouds.cloud_scenes import frame_of
 from tests.conftest import SCENARIO
+from tests.formats.workbooks import write_xlsx
 
 ELEVATIONS_DEG, CLOCKWISE_DEG = [15.0, 1.5, -0.25, -25.0], [3.1, 1.0, -1.1, -3.2]
 
@@ -211,6 +212,11 @@ def windowed(window: Any) -> dict[str, Any]:
         (changed(data_format={"columns_per_frame": 512.5}), "columns_per_frame: expected a whole number"),
         (windowed([0, 64]), "column_window: expected two columns"),
         (windowed("x"), "column_window: expected two columns"),
+        (changed(data_format={"pixels_per_column": 64}), "beam_altitude_angles: expected 64 values, .* got 4"),
+        (
+            changed(beam_altitude_angles=[1, 0.0, 0.0, 0], beam_azimuth_angles=[1, 0.0, 0.0, 0]),
+            "3 of 4 rings have elevation 0 and azimuth 0",
+        ),
         (changed(**dict.fromkeys(("beam_altitude_angles", "beam_azimuth_angles"), [0] * 200), lidar_mode="90000x1"),
          "18,000,000 beams"),
     ],
@@ -218,6 +224,58 @@ def windowed(window: Any) -> dict[str, Any]:
 def test_rejects_wrong_metadata(tmp_path: Path, content: Any, message: str) -> None:
     with pytest.raises(InputError, match=r"metadata\.json.*" + message):
         read_beam_file(write(tmp_path, "metadata.json", content))
+
+
+TABLE = "elevation_deg;azimuth_offset_deg\n15,5;-4,226\n-1,25;1,39\n"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        TABLE.encode(),
+        ("sep=;\n" + TABLE).encode("utf-8-sig"),
+        TABLE.encode("utf-16"),
+        TABLE.replace(";", "\t").encode(),
+        TABLE.replace(",", ".").replace(";", "\t").encode(),
+        TABLE.replace(",", ".").replace(";", ",").encode(),
+        TABLE.replace("_deg\n", "_deg;Name\n").replace("226", "226;hänge").replace("39", "39;").encode("cp1252"),
+        b"15.5\t4.226\n-1.25\t-1.39\n",
+        b"Laser id\tElevation\tAzimuth\n1\t15.5\t4.226\n2\t-1.25\t-1.39\n",
+    ],
+)
+def test_tables_are_read_as_offices_write_them(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "rings.csv"
+    path.write_bytes(content)
+    rings = rings_of(path)
+    assert rings.elevations_deg == (15.5, -1.25) and rings.azimuth_offsets_deg == (-4.226, 1.39)
+
+
+@pytest.mark.system  # a workbook is read in a process of its own
+def test_workbook_of_rings(tmp_path: Path) -> None:
+    pytest.importorskip("python_calamine")
+    rows = [["elevation_deg", "azimuth_offset_deg"], [15.5, -4.226], [-1.25, 1.39]]
+    write_xlsx(tmp_path / "rings.xlsx", {"unit": rows})
+    assert rings_of(tmp_path / "rings.xlsx").elevations_deg == (15.5, -1.25)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("rated_reflectivity", 10, "rated_reflectivity: expected a share above 0 and up to 1, got 10: 10 % is 0.1"),
+        ("rated_reflectivity", 0, "rated_reflectivity"),
+        (
+            "azimuth_step_deg",
+            0.3516,
+            r"0\.3516 does not divide 360. The nearest that does is 0\.3515625 \(360 / 1024\)",
+        ),
+    ],
+)
+def test_values_of_data_sheets_are_explained(tmp_path: Path, key: str, value: float, message: str) -> None:
+    keys = {"azimuth_step_deg": 0.5, "range_m": 80} | {key: value}
+    lines = "".join(f"{name} = {number}\n" for name, number in keys.items())
+    (tmp_path / "scenario.toml").write_text(SCENARIO + f"[sensors.mine]\nelevations_deg = [1, 2]\n{lines}")
+    with pytest.raises(InputError, match=message):
+        egvs.load(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -243,6 +301,8 @@ def test_rejects_wrong_metadata(tmp_path: Path, content: Any, message: str) -> N
         ("1.5,2\n3,x\n", "ring 1: horizontal: expected a number"),
         ("1.5,2\n95,0\n", "ring 1: vertical: expected a number between -90 and 90"),
         ("1,5,2\n", "no column elevation_deg"),
+        ("elevation_deg,azimuth_offset_deg\n1,2\n" + "0.0,0\n" * 52, "52 of 53 rings have elevation 0"),
+        ("elevation_deg;azimuth_offset_deg\n1;2;3\n", "line 2: expected 2 values, got 3"),
     ],
 )
 def test_rejects_wrong_tables(tmp_path: Path, text: str, message: str) -> None:
@@ -337,6 +397,8 @@ def test_prints_what_is_read(tmp_path: Path, run_egvs: Any) -> None:
     words = " ".join(printed.split())
     assert code == 0 and "mine beams: 2 of one turn or frame; scan pattern without rings" in words
     assert "view: azimuth 2 to 4 deg, elevation -3 to 1 deg range: 80 m" in words
+    assert f"source: [sensors.mine] of {tmp_path / 'scenario.toml'}, beams from rings.csv" in words
+    assert "mount: upright, unless [sites] or a row says otherwise" in words
     assert "warning: mine has 2 beams in a turn or frame" in words and "VLP-16 beams: 28800" in words
     code, _, error = run_egvs("sensors", "mime", "--scenario", tmp_path)
     assert code == 2 and "unknown sensor 'mime'. Did you mean mine?" in error

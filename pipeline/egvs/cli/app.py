@@ -172,8 +172,11 @@ def check(
     from egvs.runs.run_sources import SettingsSource
     from egvs.stages import check
 
-    checked = check.check_scenario(SettingsSource.of(scenario, set_).load())
+    loaded = SettingsSource.of(scenario, set_).load()
+    checked = check.check_scenario(loaded)
     run_tables.print_check(checked, with_details=verbose)
+    if not checked.errors:
+        run_tables.print_mounts(loaded)
     if verbose:
         run_tables.print_protections(sandbox.missing_protections())
     if checked.errors:
@@ -586,7 +589,7 @@ def sensors(
         if name in files:
             run_tables.print_beam_file(Path(name), files[name])
         else:
-            run_tables.print_sensor_details([custom[name] if name in custom else CATALOGUE[name]])
+            run_tables.print_sensor_details([custom[name] if name in custom else CATALOGUE[name]], loaded)
 
 
 @app.command(cls=cli_options.NewCommand)

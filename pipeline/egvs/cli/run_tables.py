@@ -40,6 +40,7 @@ from egvs.sensors.sensor import FEW_BEAMS, FEW_BEAMS_HINT, describe_few_beams
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
     from egvs.scenario.model import Scenario
+    from egvs.scenario.sensor_config import SensorConfig
     from egvs.sensors.beam_files import BeamFile
     from egvs.sensors.sensor import Sensor
     from egvs.stages.check import CheckReport
@@ -336,6 +337,16 @@ def print_check(checked: CheckReport, *, with_details: bool = False) -> None:
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
 
 
+def print_mounts(scenario: Scenario) -> None:
+    """Print which sensors hang upside down at how many sites; nothing where all stand."""
+    from egvs.sensors.sites import candidate_sites
+
+    sites = candidate_sites(scenario)
+    for sensor in dict.fromkeys(site.sensor for site in sites if site.pose.is_inverted):
+        mounts = [site.pose.is_inverted for site in sites if site.sensor == sensor]
+        print_sentences([f"{sensor} hangs upside down at {sum(mounts):,} of {len(mounts):,} sites"])
+
+
 def _format_distance(distance_m: float) -> str:
     return format_or_dash(None if math.isnan(distance_m) else distance_m, ".1f")
 
@@ -400,12 +411,15 @@ def _format_dark_range(sensor: Sensor) -> str:
     return f"{format_or_dash(dark_range_m(sensor), '.0f')} {mark}"
 
 
-def print_sensor_details(sensors: Iterable[Sensor]) -> None:
-    """Print all that is known of some sensors, with the sources."""
+def print_sensor_details(sensors: Iterable[Sensor], scenario: Scenario | None = None) -> None:
+    """Print all that is known of some sensors, with the sources; ``scenario`` is that of custom sensors."""
     for sensor in sensors:
+        config = None if scenario is None else scenario.sensors.get(sensor.name)
         step = ""
         if sensor.azimuth_step_deg is not None:
-            step = f", {sensor.azimuth_step_deg:.4g} deg apart in azimuth"
+            step = f", {sensor.azimuth_step_deg:.12g} deg apart in azimuth"
+        if any(sensor.azimuth_offsets_deg):
+            step += f"; azimuth offsets {_format_span(sensor.azimuth_offsets_deg)}, counter-clockwise"
         rings = f"{sensor.channels} rings" if sensor.channels else "scan pattern without rings"
         divergence_mrad = " x ".join(f"{angle:g}" for angle in sensor.divergence_mrad)
         lines = [
@@ -415,8 +429,11 @@ def print_sensor_details(sensors: Iterable[Sensor]) -> None:
             f"  range: {sensor.range_m:g} m; rated: {_format_rating(sensor, ' m')}",
             f"  laser: {sensor.wavelength_nm:g} nm, divergence {divergence_mrad} mrad, range noise "
             f"{sensor.range_sigma_m:g} m",
-            f"  source: {sensor.source}",
+            f"  source: {sensor.source if config is None else _describe_source(sensor, config, scenario)}",
         ]
+        if config is not None:
+            mount = "upside down" if config.mount == "inverted" else "upright"
+            lines.append(f"  mount: {mount}, unless [sites] or a row says otherwise")
         if sensor.rated_range_m is not None:
             model = ReturnModel.of(sensor)
             lines.append(
@@ -432,6 +449,12 @@ def print_sensor_details(sensors: Iterable[Sensor]) -> None:
         if few is not None:
             lines.append(f"  warning: {few}. {FEW_BEAMS_HINT}")
         print_sentences(lines)
+
+
+def _describe_source(sensor: Sensor, config: SensorConfig, scenario: Scenario | None) -> str:
+    """Return the table of a custom sensor, and the file of its beams."""
+    file = "" if config.beam_file is None else f", {config.beam_file[0]} from {config.beam_file[1]}"
+    return f"[sensors.{sensor.name}] of {'the scenario' if scenario is None else scenario.file}{file}"
 
 
 def print_beam_file(path: Path, file: BeamFile) -> None:

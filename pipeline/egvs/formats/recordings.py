@@ -20,6 +20,9 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.formats.reader_process import Block, read_blocks
 from egvs.formats.recording_options import RecordingOptions
 
+TIME_FIELDS = ("time", "timestamp", "t", "offset_time", "time_stamp")
+"""Names of the field with the time of each point."""
+
 RING_FIELDS = ("ring", "channel", "laser_id")
 """Names of the field that says which ring a point is from; the first that a file has counts."""
 
@@ -117,6 +120,15 @@ def _plausible_times(time_s: FloatArray) -> FloatArray | None:
         return None
     relative = time_s - np.nanmin(time_s)
     return relative if _SPANS_S[0] <= np.nanmax(relative) <= _SPANS_S[1] else None
+
+
+def times_of_field(field: FloatArray) -> FloatArray | None:
+    """Return times in seconds, from the earliest, of a field in seconds or nanoseconds; None for other values."""
+    for unit_s in (1.0, 1e-9):
+        time_s = _plausible_times((field - np.nanmin(field, initial=np.inf)) * unit_s)
+        if time_s is not None:
+            return time_s
+    return None
 
 
 def ring_numbers(field: FloatArray) -> IntArray | None:

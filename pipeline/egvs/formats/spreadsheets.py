@@ -134,6 +134,34 @@ def read_rows(path: Path, check_header: CheckHeader) -> TableRows:
     return TableRows(rows, errors)
 
 
+def is_plain_csv(head: bytes) -> bool:
+    """Return whether a file that begins with these bytes has commas between columns, and is no workbook or UTF-16."""
+    first = head.removeprefix(b"\xef\xbb\xbf").lstrip().partition(b"\n")[0]
+    return not any(mark in first for mark in (b";", b"\t", b"\0")) and not head.startswith(
+        (*_WORKBOOK_SIGNATURES, b"\xff\xfe", b"\xfe\xff")
+    )
+
+
+def read_cells(path: Path) -> list[list[str]]:
+    """Return header and rows of a table with any kind of header, or none; numbers have decimal points.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_rows`.
+    """
+    data = limits.read_bytes(path, limits.DOCUMENT)
+    if data.startswith(_WORKBOOK_SIGNATURES):
+        table, header = _choose_sheet(path, list(_read_workbook(path)), lambda names: names)
+    else:
+        table = _read_text(path, data)
+        header = table.header
+    raise_together(table.errors, "table")
+    _use_decimal_points(table)
+    first = [cell.replace(",", ".") if _COMMA_NUMBER.fullmatch(cell) else cell for cell in header]
+    return [first, *(cells for _, cells in table.rows)]
+
+
 def _formula_error(where: str, text: str) -> InputError:
     if text == workbooks.NO_VALUE:
         return InputError(where, text, "Open the table in a spreadsheet program, and save it.")

@@ -29,7 +29,15 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.core.reading import COMPLETE_FILE, translate_errors
 from egvs.formats import point_clouds
 from egvs.formats.recording_options import RecordingOptions
-from egvs.formats.recordings import RING_FIELDS, RecordedSweep, Recording, chosen_sweeps, ring_numbers
+from egvs.formats.recordings import (
+    RING_FIELDS,
+    TIME_FIELDS,
+    RecordedSweep,
+    Recording,
+    chosen_sweeps,
+    ring_numbers,
+    times_of_field,
+)
 
 MIN_RETURNS = 2000
 """Fewest returns of a sweep; sensors with rings have 30,000 or more."""
@@ -167,7 +175,9 @@ def _read_file(path: Path, name: str) -> list[Sweep]:
         raise InputError(name, "expected a sweep, got no points", COMPLETE_FILE)
     sweep = _clean_sweep(name, np.concatenate(chunks))
     field = point_clouds.read_field(path, name, RING_FIELDS)
-    return [sweep if field is None else replace(sweep, ring=ring_numbers(field))]
+    time = point_clouds.read_field(path, name, TIME_FIELDS)
+    ring = None if field is None else ring_numbers(field)
+    return [replace(sweep, ring=ring, time_s=None if time is None else times_of_field(time))]
 
 
 def _read_npz(path: Path, name: str) -> Iterator[Sweep]:

@@ -89,7 +89,7 @@ def describe_reliability(
     ]
     (low_deg, high_deg), roll_deg = STUDY.larger_study.pitch_deg, STUDY.larger_study.roll_deg
     is_pitched = not low_deg - _PITCH_TOLERANCE_DEG <= best.pitch_deg <= high_deg + _PITCH_TOLERANCE_DEG
-    if is_pitched or abs(best.roll_deg) > roll_deg:
+    if is_pitched or abs(best.pose.side_tilt_deg) > roll_deg:  # upside down is no tilt
         sentences.append(_TILT_NOTE.format(best.site, low_deg, high_deg, roll_deg))
     limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
     if limits:

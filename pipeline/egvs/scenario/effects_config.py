@@ -23,7 +23,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from egvs.core import plugins
-from egvs.scenario.fields import Positive, StrictModel
+from egvs.scenario.fields import Positive, Reflectivity, StrictModel
 
 GROUP = "egvs.effects"
 """Entry points of effects, including the built-in ones."""
@@ -50,7 +50,9 @@ class RangeLimitParameters(EffectParameters):
     )
     dropout: float | None = Field(None, ge=0, le=1, description="Share lost at any range. By default each sensor's")
     rated_range_m: float | None = Field(None, gt=0, description="Rated range, instead of each sensor's")
-    rated_reflectivity: float | None = Field(None, gt=0, description="Rated reflectivity, instead of each sensor's")
+    rated_reflectivity: Reflectivity | None = Field(
+        None, description="Rated reflectivity, up to 1, instead of each sensor's"
+    )
 
 
 class RainParameters(EffectParameters):

@@ -12,7 +12,7 @@ import unicodedata
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 
 class StrictModel(BaseModel):
@@ -83,6 +83,15 @@ def parse_coordinate_m(text: str) -> float:
 
 Positive = Annotated[float, Field(gt=0)]
 Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
+
+
+def _check_no_percent(value: object) -> object:
+    if isinstance(value, int | float) and 1.0 < value <= 100.0:
+        raise ValueError(f"expected a share above 0 and up to 1, got {value:g}: {value:g} % is {value / 100:g}")
+    return value
+
+
+Reflectivity = Annotated[float, BeforeValidator(_check_no_percent), Field(gt=0, le=1)]
 NotNegative = Annotated[float, Field(ge=0)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Latitude = Annotated[float, Field(ge=-90, le=90)]

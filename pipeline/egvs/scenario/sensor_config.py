@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from egvs.core import limits
-from egvs.scenario.fields import NotNegative, Positive, SensorMount, StrictModel
+from egvs.scenario.fields import NotNegative, Positive, Reflectivity, SensorMount, StrictModel
 
 MAX_RINGS = 10_000
 """More than ten times as many as any sensor has."""
@@ -88,8 +88,8 @@ class SensorConfig(StrictModel):
     )
     beams: str | None = Field(
         None,
-        description="A file of beams or rings: a table (CSV), an Ouster's metadata (JSON), angles of Hesai or RoboSense"
-        " (CSV)",
+        description="A file of beams or rings: a table (CSV, xlsx, ods), an Ouster's metadata (JSON), angles of Hesai"
+        " or RoboSense (CSV)",
     )
     pattern: BeamPatternConfig | None = None
     range_m: Positive = Field(description="Maximum range")
@@ -100,7 +100,7 @@ class SensorConfig(StrictModel):
     rated_range_m: Positive | None = Field(
         None, description="Range at which a target of rated_reflectivity is just detected; without it, no losses"
     )
-    rated_reflectivity: Positive = Field(0.8, description="Reflectivity of the target of rated_range_m")
+    rated_reflectivity: Reflectivity = Field(0.8, description="Reflectivity of the target of rated_range_m, up to 1")
     softness: NotNegative = Field(
         1.0, description="Standard deviation of the logarithm of the power that vehicles return; fitted on two units"
     )
@@ -201,5 +201,7 @@ class SensorConfig(StrictModel):
                 raise ValueError(f"{interval} must be ascending, by less than 360. Omit it for the full circle")
         steps = width / self.azimuth_step_deg
         if abs(steps - round(steps)) > 1e-9 * steps:
-            raise ValueError(f"azimuth_step_deg = {self.azimuth_step_deg:g} does not divide {what}")
+            whole = max(1, round(steps))
+            nearest = f"The nearest that does is {width / whole!r} ({width:g} / {whole})"
+            raise ValueError(f"azimuth_step_deg = {self.azimuth_step_deg:.12g} does not divide {what}. {nearest}")
         return self

@@ -15,7 +15,8 @@ Ouster, metadata (JSON)       ``beam_altitude_angles``, ``beam_azimuth_angles`` 
                               ``lidar_data_format`` and ``config_params``
 ============================  =========================================================================================
 
-CSV files are recognised by their header, or by having none. Elevations of an Ouster are those of the beams, which leave
+Tables are recognised by their header, or by having none; CSV stands for any table that
+:mod:`egvs.formats.spreadsheets` reads. Elevations of an Ouster are those of the beams, which leave
 ``lidar_origin_to_beam_origin_mm`` beside the axis; like the vertical offsets of a table, this distance is read and
 printed, but simulated beams start at the position of the sensor.
 
@@ -45,6 +46,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import number_or_nan, parse_decimal
 from egvs.core.reading import read_json
+from egvs.formats import spreadsheets
 from egvs.scenario.sensor_config import MAX_RINGS
 
 BEAM_COLUMNS = ("elevation_deg", "azimuth_deg")
@@ -57,6 +59,7 @@ MAX_DWELL_S = 1e6
 MAX_COLUMNS = 100_000
 """Columns of a turn: fifty times as many as any sensor has."""
 
+_HEAD_BYTES = 4096
 _GAP_DEG = 5.0
 """A beam table without a wider gap between azimuths covers the full circle."""
 _GAP_TOLERANCE_DEG = 1e-6
@@ -66,7 +69,7 @@ _HESAI_MARK, _CHECKSUM = "eeff", re.compile(r"[0-9a-fA-F]{32,128}")
 _MODE = re.compile(r"(\d{1,6})x(\d{1,3})")
 _CSV_HINT = (
     "The header needs the columns elevation_deg, azimuth_deg (a row per beam) or elevation_deg, azimuth_offset_deg (a"
-    " row per ring), separated by commas."
+    " row per ring)."
 )
 _DWELL_HINT = (
     "List each direction once, with the seconds that the beam pointed there: elevation_deg,azimuth_deg,dwell_s."
@@ -175,7 +178,7 @@ def is_beam_file(name: str) -> bool:
     >>> is_beam_file("units/metadata.json"), is_beam_file("OS1-64")
     (True, False)
     """
-    return Path(name).suffix.lower() in {".csv", ".json", ".txt"}
+    return Path(name).suffix.lower() in {*spreadsheets.SUFFIXES, ".json", ".txt", ".tsv"}
 
 
 def read_beam_file(path: Path) -> BeamFile:
@@ -230,6 +233,10 @@ def _read_cached(path: Path, _content_hash: str) -> BeamFile:
     limits.checked_size(path, limits.FILE)
     if path.suffix.lower() == ".json":
         return BeamFile("Ouster metadata", _read_ouster(path))
+    with open_input(path) as content:
+        is_plain = spreadsheets.is_plain_csv(content.read(_HEAD_BYTES))
+    if not is_plain:
+        return _read_csv(path, iter(spreadsheets.read_cells(path)))
     try:
         with open_input(path) as content, io.TextIOWrapper(content, "utf-8-sig", newline="") as file:
             return _read_csv(path, csv.reader(file, skipinitialspace=True))
@@ -335,6 +342,7 @@ def _rings(
         _check_width(where, row, width)
         for index, (name, column) in enumerate(zip(names, columns, strict=True)):
             values[number, index] = _parse(f"{where}: {name}", _cell(row, column), bounds[index])
+    _check_padding(path, values[:, 0], values[:, 1])
     vertical = tuple(values[:, 2].tolist()) if len(columns) > 2 else ()
     return Rings(tuple(values[:, 0].tolist()), tuple((sign * values[:, 1] + 0.0).tolist()), vertical)
 
@@ -345,6 +353,14 @@ def _check_ring_count(where: object, count: int) -> None:
     if count > MAX_RINGS:
         hint = "Name the column azimuth_deg if each row is a single beam."
         raise InputError(where, f"expected at most {MAX_RINGS:,} rings, got more", hint)
+
+
+def _check_padding(where: object, elevations_deg: FloatArray, offsets_deg: FloatArray) -> None:
+    """Raise an InputError if several rings have both angles 0, as of a table that was filled up."""
+    count = int(np.count_nonzero((elevations_deg == 0.0) & (offsets_deg == 0.0)))
+    if count > 1:
+        problem = f"{count} of {len(elevations_deg)} rings have elevation 0 and azimuth 0, as if the list was filled up"
+        raise InputError(where, problem, "Give the angles of all rings, or remove these rows.")
 
 
 def _check_lasers(path: Path, rows: list[list[str]], column: int) -> None:
@@ -388,12 +404,18 @@ def _read_ouster(path: Path) -> Rings:
     if len(azimuths_deg) != len(elevations_deg):
         problem = f"expected {len(elevations_deg)} values, one per beam_altitude_angles, got {len(azimuths_deg)}"
         raise InputError(f"{path}: beam_azimuth_angles", problem, _OUSTER_HINT)
+    form = _section(path, document, "lidar_data_format") or _section(path, document, "data_format")
+    pixels = form.get("pixels_per_column", len(elevations_deg))
+    if pixels != len(elevations_deg):
+        problem = f"expected {str(pixels)[:40]} values, one per pixels_per_column, got {len(elevations_deg)}"
+        raise InputError(f"{path}: beam_altitude_angles", problem, _OUSTER_HINT)
     distance_mm = beams.get("lidar_origin_to_beam_origin_mm", 0.0)
     if not _is_finite(distance_mm) or not 0.0 <= distance_mm <= 1000.0 * MAX_OFFSET_M:
         problem = f"expected a distance from 0 to {1000 * MAX_OFFSET_M:g} mm, got {str(distance_mm)[:40]!r}"
         raise InputError(f"{path}: lidar_origin_to_beam_origin_mm", problem, _OUSTER_HINT)
     columns, window = _columns(path, document)
     limits.BEAMS.check(path, columns * len(elevations_deg))
+    _check_padding(path, np.array(elevations_deg), np.array(azimuths_deg))
     return Rings(
         elevations_deg,
         tuple(-angle + 0.0 for angle in azimuths_deg),

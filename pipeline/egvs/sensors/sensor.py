@@ -103,7 +103,7 @@ def describe_odd_angles(
             f"the azimuth offsets of {name} extend over {offset_span_deg:.3g} degrees, its elevations over"
             f" {span_deg:.3g}: they look swapped"
         )
-        return problem, "Swap the headings of the two columns, or the columns if they have none."
+        return problem, "Swap the names of the two columns or lists, or the columns if they have no names."
     return None
 
 

@@ -116,3 +116,23 @@ def test_defaults_of_recordings_have_one_definition() -> None:
     options = {name: parameter.default for name, parameter in inspect.signature(sensor.fit).parameters.items()}
     assert RecordingOptions() == RecordingOptions(None, options["max_sweeps"], options["max_range"])
     assert (options["max_sweeps"], options["max_range"]) == (20, 500.0)
+
+
+@pytest.mark.parametrize(("unit_s", "kind"), [(1e-9, "U"), (1.0, "F")])
+def test_times_of_points_of_a_file_give_the_rotation(tmp_path: Path, run_egvs: Any, unit_s: float, kind: str) -> None:
+    """An Ouster's field t counts nanoseconds; others have seconds."""
+    points_m = sweep_of(TRUTH, coarse_sensor())
+    times = np.repeat(np.arange(300), 10) * 0.1 / 300 / unit_s
+    returned = np.isfinite(points_m[:, 0])
+    rows = np.column_stack([points_m, times])[returned]
+    header = (
+        f"VERSION 0.7\nFIELDS x y z t\nSIZE 8 8 8 {4 if kind == 'U' else 8}\nTYPE F F F {kind}\nCOUNT 1 1 1 1\n"
+        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA ascii\n"
+    )
+    lines = [f"{x!r} {y!r} {z!r} {round(t) if kind == 'U' else t!r}" for x, y, z, t in rows.tolist()]
+    (tmp_path / "sweep.pcd").write_text(header + "\n".join(lines) + "\n")
+    code, printed, error = run_egvs(
+        "sensor", "fit", tmp_path / "sweep.pcd", "--name", "mast", "--out", tmp_path / "made"
+    )
+    assert code == 0, error
+    assert "rotation: 10.0" in printed and "from times of points" in printed.replace("\n", " ")

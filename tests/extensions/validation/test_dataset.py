@@ -272,6 +272,18 @@ def test_removes_files_of_killed_export_and_fills_empty_folder(four_sites, tmp_p
     assert not list(tmp_path.glob(".out*"))
 
 
+def test_run_folder_stands_for_its_scenario(mini, tmp_path, run_egvs):
+    assert run_egvs("run", mini, "--out", tmp_path / "run")[0] == 0
+    for number, path in enumerate((mini, tmp_path / "run")):
+        code, _, error = run_egvs("clouds", path, "--frames", 2, "--out", tmp_path / f"clouds{number}")
+        assert code == 0, error
+    files = sorted(path.relative_to(tmp_path / "clouds0") for path in (tmp_path / "clouds0").rglob("*.bin"))
+    assert files
+    assert all(
+        (tmp_path / "clouds0" / name).read_bytes() == (tmp_path / "clouds1" / name).read_bytes() for name in files
+    )
+
+
 def test_long_vehicles_without_class_are_no_cars(four_sites, tmp_path, run_egvs):
     """The type of vehicle names no vClass, so SUMO's default, passenger, is that of a 12 m bus."""
     words = ("--site", "level", "--frames", "2", "--set", "traffic.kinds.car.length_m=12")

@@ -9,7 +9,7 @@ import typer
 
 from egvs.cli import options, sources
 from egvs.cli.commands import Command
-from egvs.cli.options import Jobs, Out, ScenarioPath, Set
+from egvs.cli.options import Jobs, Out, Set, SettingsPath
 from egvs.core.errors import InputError, MissingBackendError
 
 if TYPE_CHECKING:
@@ -251,7 +251,7 @@ def _column_names(text: str | None) -> dict[str, str]:
 
 
 def clouds(
-    scenario: ScenarioPath,
+    scenario: SettingsPath,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="A new or empty folder.")],
     site: Annotated[
         list[str] | None, typer.Option(metavar="SITE", help="Only this site (repeatable); all by default.")
@@ -266,9 +266,9 @@ def clouds(
     from egvs.cli.console import ProgressDisplay
     from egvs.extensions.validation import tables as validation_tables
     from egvs.extensions.validation.dataset import write_dataset
-    from egvs.scenario.loading import load
+    from egvs.runs.run_sources import SettingsSource
 
-    loaded = load(scenario, set_ or ())
+    loaded = SettingsSource.of(scenario, set_).load()
     with ProgressDisplay("clouds") as screen:
         dataset = write_dataset(
             loaded,

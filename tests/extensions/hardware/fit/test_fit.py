@@ -15,6 +15,7 @@ import pytest
 from benchmarks.sensor_fit import SENSORS, angle_errors, fit_list, hard_truth, interval_hits
 from benchmarks.simulated_sweeps import Truth, simulate_sweep
 
+from egvs.core.errors import InputError
 from egvs.extensions.hardware.fit.beam_angles import fit_beam_angles
 from egvs.extensions.hardware.fit.calibration import read_calibrated_pose
 from egvs.extensions.hardware.fit.empty_scan import TRAFFIC
@@ -173,3 +174,16 @@ def test_chengdu_ground_and_traffic(chengdu: SensorFit) -> None:
     above = above[np.isfinite(above)]
     assert len(above) > 1000
     assert np.mean((above > 0.2) & (above < 4.5)) > 0.9  # vehicles stand on the road
+
+
+@pytest.mark.parametrize(("has_ground", "hint"), [(True, "it was probably levelled"), (False, "neither levelled nor")])
+def test_azimuths_without_a_step_may_be_those_of_a_levelled_sweep(has_ground: bool, hint: str) -> None:
+    """Rings at random azimuths, over exactly level ground or within a round wall."""
+    rng = np.random.default_rng(0)
+    elevation = np.radians(np.repeat(np.linspace(-20.0, -5.0, 12), 400))
+    azimuth = rng.uniform(-np.pi, np.pi, len(elevation))
+    radius_m = 4.0 / np.tan(-elevation) if has_ground else np.full(len(elevation), 10.0)
+    x, y = radius_m * np.cos(azimuth), radius_m * np.sin(azimuth)
+    points_m = np.column_stack([x, y, radius_m * np.tan(elevation)])
+    with pytest.raises(InputError, match=f"have no common step.*{hint}"):
+        fit_sensor([Sweep("sweep", points_m)])

@@ -24,7 +24,7 @@ from egvs.extensions.hardware.installation.scan_comparison import ScanComparison
 from egvs.extensions.hardware.registration import PARAMETERS, StaticSurfaces, register_scan
 from egvs.scoring.visibility import Beams
 from egvs.sensors.beam_files import BeamTable
-from egvs.sensors.sensor import Sensor
+from egvs.sensors.sensor import Sensor, rotation_world_sensor
 from egvs.sensors.sites import Pose
 from egvs.world.ray_casting import Caster
 from tests.conftest import collection, feature
@@ -318,7 +318,10 @@ def test_rejects_scan_that_cannot_be_one(installed: InstalledRun, run_egvs: Any,
 
 
 def write_street(
-    folder: Path, *more: tuple[str, list[list[float]], float], sites: str = "pole_a,10,0,5,0,-5\n"
+    folder: Path,
+    *more: tuple[str, list[list[float]], float],
+    sites: str = "pole_a,10,0,5,0,-5\n",
+    mount: str = "upright",
 ) -> InstalledRun:
     """Make a run of a street whose two sides are alike, about the sensor at (10, 0, 5), with more houses."""
     scenario = write_installed_scenario(folder / "street")
@@ -332,7 +335,7 @@ def write_street(
     ]
     (scenario / "statics.geojson").write_text(collection(*features))
     (scenario / "sites.csv").write_text(f"site,x_m,y_m,z_m,yaw_deg,pitch_deg\n{sites}")
-    egvs.run(egvs.load(scenario), folder / "run", jobs=1)
+    egvs.run(egvs.load(scenario, [f"sites.mount={mount}"]), folder / "run", jobs=1)
     (folder / "scans").mkdir()
     return InstalledRun(folder / "run", folder / "scans")
 
@@ -361,6 +364,46 @@ def test_rejects_scan_of_another_place(installed: InstalledRun) -> None:
     message = rf"scan0\.pcd: this scan was not taken at {here.name}; it fits {there.name}\. Use --site {there.name}"
     with pytest.raises(InputError, match=message):
         accept_points(installed, elsewhere)
+
+
+@pytest.mark.parametrize(
+    ("turn", "message"),
+    [
+        (np.diag([1.0, -1.0, -1.0]), "it is the other way up.* plan it with mount inverted"),
+        (np.diag([1.0, 1.0, -1.0]), "with z reversed"),
+    ],
+)
+def test_names_the_frame_in_which_a_scan_fits(tmp_path: Path, turn: np.ndarray, message: str) -> None:
+    kiosk = ("kiosk", [[18, 4], [24, 4], [24, 8], [18, 8]], 4.0)
+    street = write_street(tmp_path, kiosk)
+    with pytest.raises(InputError, match=message):
+        accept_points(street, street.points() @ turn)
+
+
+def test_says_that_a_scan_was_levelled(tmp_path: Path) -> None:
+    """Upright, its pose is found and exactly level; upside down, it is not found in the sensor's frame."""
+    kiosk = ("kiosk", [[18, 4], [24, 4], [24, 8], [18, 8]], 4.0)
+    street = write_street(tmp_path, kiosk, sites="pole_a,10,0,5,0,-5\n")
+    points = street.points()
+    assert not any("levelled" in note for note in accept_points(street, points).notes)
+    level = points @ rotation_world_sensor(0.0, -5.0, 0.0).T
+    assert any("was the scan levelled?" in note for note in accept_points(street, level).notes)
+    (tmp_path / "hung").mkdir()
+    hung = write_street(tmp_path / "hung", kiosk, sites="pole_a,10,0,5,0,-5\n", mount="inverted")
+    level = hung.points() @ rotation_world_sensor(0.0, -5.0, 180.0).T
+    with pytest.raises(InputError, match="at pitch 0 and roll 0: it was levelled"):
+        accept_points(hung, level)
+
+
+def test_names_the_closest_mount_of_another_pole(tmp_path: Path) -> None:
+    start = ("start", [[-40, -9], [-30, -9], [-30, 9], [-40, 9]], 12.0)
+    kiosk = ("kiosk", [[22, 3], [27, 3], [27, 7], [22, 7]], 4.0)
+    rows = "pole_a,10,5,5,-90,-5\nb_level,30,-5,5,90,0\nb_down,30,-5,5,90,-10\nb_high,30,-5,6,90,-10\n"
+    street = write_street(tmp_path, start, kiosk, sites=rows)
+    there = street.sites.site("b_down")
+    scan = simulate_scan(street.sites.session.scene, street.sites.sensor(there), there.pose, there.pose, sigma_m=0.02)
+    with pytest.raises(InputError, match=r"it fits b_down\. Use --site b_down"):
+        accept_points(street, scan)
 
 
 def test_rejects_scan_that_fits_no_site(installed: InstalledRun) -> None:

@@ -82,7 +82,7 @@ def test_sensor_that_is_upside_down_is_described_as_it_hangs(installed: Installe
     assert dict(data.orientation_rows)["Mount"] == "upright"
     site = replace(data.site, pose=replace(data.pose, roll_deg=-178.5))
     rows = dict(replace(data, site=site).orientation_rows)
-    assert rows["Mount"] == "upside down, cable outlet down"
+    assert rows["Mount"] == "upside down, the base on top"
     assert rows["Roll"] == "1.5°, left side up"
     assert f"{-high_deg:+.0f}° to {-low_deg:+.0f}°" in rows["Field of view"]
 

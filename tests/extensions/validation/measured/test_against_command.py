@@ -235,3 +235,21 @@ def test_other_rings_are_told_and_nothing_is_fitted(folder: Path, tmp_path: Path
     code, printed, error = run_egvs("validate", *common, "--sensor", SENSOR)
     assert code == 0, error
     assert "rings do not match" not in printed
+
+
+def test_sensor_may_be_a_file(folder: Path, tmp_path: Path, run_egvs: Any) -> None:
+    """The file of a fit, named as it is written; one message for a wrong one."""
+    file = tmp_path / "sensor.toml"
+    file.write_text(format_sensor_table("unit", sensor_keys(CATALOGUE[SENSOR])), encoding="utf-8")
+    common = ("validate", "--against", folder, "--labels", folder, "--detector", "points", "--sensor", file)
+    code, printed, error = run_egvs(*common, "--out", tmp_path / "out")
+    assert code == 0, error
+    assert "unit: 16 labelled boxes" in printed
+    for text, message in (
+        ("[sensors.a]\nrange_m = 0\n", "sensor.toml: sensors.a"),
+        ("x = 1\n", "sensor.toml: expected one table [sensors.NAME], got 0"),
+        ("[[", "sensor.toml"),
+    ):
+        file.write_text(text, encoding="utf-8")
+        code, _, error = run_egvs(*common, "--out", tmp_path / "no")
+        assert code == 2 and message in error and "Traceback" not in error

@@ -27,6 +27,7 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.core.wording import format_percent
 from egvs.extensions.hardware.fit.sweep_layout import Layout, axis_distances_m, find_layout, fit_cone, nearest_ring
 from egvs.formats.sweep_files import Sweep
+from egvs.sensors.ground_plane import find_ground_planes
 
 _OFFSET_ROUNDING_M = 1e-5
 """Offsets are not more exact than this."""
@@ -34,6 +35,8 @@ _FULL_CIRCLE_GAP_DEG = 60.0
 """A wider gap without any return is taken for the end of the field of view, in a list of returns."""
 _MAX_AZIMUTHS = 20_000
 _MIN_COHERENCE = 0.5
+_LEVEL_DEG = 0.3
+"""No crew mounts a sensor so exactly upright over a road; programs level sweeps."""
 _RANGE_STEPS_M = (0.001, 0.05)
 _MIN_STEP_COHERENCE = 0.5
 _MIN_HARMONIC = 0.5
@@ -347,6 +350,18 @@ def _slope_error(centred: FloatArray, residual_deg: FloatArray, column: IntArray
     return float(np.sqrt(19 / 20 * ((slopes - slopes.mean()) ** 2).sum()))
 
 
+def _frame_hint(sweep: Sweep) -> str:
+    """Return why the azimuths of a sweep may have no step: it is levelled, if its ground is so exactly level."""
+    points_m = sweep.points_m[np.isfinite(sweep.points_m[:, 0])]
+    try:
+        plane = find_ground_planes(points_m, np.broadcast_to((0.0, 0.0, 1.0), points_m.shape), sweep.name)[0]
+    except InputError:
+        plane = None
+    if plane is not None and math.hypot(plane.roll_deg, plane.pitch_deg) < _LEVEL_DEG:
+        return "Its ground is level, so it was probably levelled: give the sweep in the sensor's own frame."
+    return "Give single sweeps in the sensor's own frame, neither levelled nor several merged into one."
+
+
 def _azimuths_of_list(sweep: Sweep, channels: int, channel: IntArray, azimuth_deg: FloatArray) -> _Azimuths:
     """Fit the step from the spacing of returns, and the offset of each channel modulo the step."""
     order = np.lexsort((azimuth_deg, channel))
@@ -359,7 +374,7 @@ def _azimuths_of_list(sweep: Sweep, channels: int, channel: IntArray, azimuth_de
     step_deg, coherence = _refine_step(channel, channels, azimuth_deg, guess_deg)
     if coherence < _MIN_COHERENCE:
         problem = f"the azimuths of its rings have no common step (best: {step_deg:.4f} degrees)"
-        raise InputError(sweep.name, problem, "Give single sweeps, not several merged into one.")
+        raise InputError(sweep.name, problem, _frame_hint(sweep))
 
     occupied = np.zeros(720, dtype=bool)
     occupied[np.floor((azimuth_deg + 180.0) * 2).astype(np.int64) % 720] = True

@@ -47,9 +47,12 @@ MAX_DISPLACEMENT_M = 3.0
 
 _GOOD_STRUCTURE_SHARE = 0.6
 """Below it, other yaws are tried."""
+_SURE_STRUCTURE_SHARE = 0.9
+"""Below it, other frames are tried."""
 _MIRROR_MARGIN = 0.02
 """A scan whose mirror image agrees with so much more of the structure is mirrored; within it, nothing can tell."""
 _MIRROR = np.array([1.0, -1.0, 1.0])
+_MIRROR_HINT = "Export y to the left of x: azimuths count counter-clockwise from above."
 _OTHER_SITE_MARGIN = 0.05
 """A scan that agrees with so much more of the structure around another pole was taken there."""
 _MAX_OTHER_POLES = 12
@@ -57,6 +60,8 @@ _BLOCKED_BEAM_DEG = 0.3
 """An expected beam is stopped by the return of an obstacle that is at most this far beside it."""
 _SEARCH_POINTS = 6_000
 """Of a scan that fits near the planned pose, about as many points tell whether other yaws fit as well."""
+_LEVELLED_DEG, _LEVEL_DEG = 2.0, 0.3
+"""A scan may have been levelled if the sensor seems to be so level, against so much tilt in the plan."""
 _STEP = 1e-4
 _METRES_HINT = "Export the scan in metres, in the sensor's frame: x forward, y left, z up."
 
@@ -343,15 +348,23 @@ def accept(
     surfaces = StaticSurfaces(scene.world, planned.pose.position_m)
     try:
         fit, comparison, others = _register(clouds, sensor, planned, surfaces, world, where, max_vehicle_height_m)
+    except _OtherFrameError:
+        raise
     except InputError:
         _check_fits_no_other_site(clouds, planned_sites, planned, 0.0, where)
         raise
-    _check_fits_no_other_site(clouds, planned_sites, planned, _structure(comparison), where)
+    share = _structure(comparison)
+    if share < _SURE_STRUCTURE_SHARE:
+        least_share = max(share + _OTHER_SITE_MARGIN, _GOOD_STRUCTURE_SHARE)
+        _check_frame(clouds, sensor, planned.pose, surfaces, world, where, least_share)
+    _check_fits_no_other_site(clouds, planned_sites, planned, share, where)
     mirror_note = _check_not_mirrored(clouds, sensor, planned.pose, surfaces, world, where, _structure(comparison))
     progress("registered", 2, steps)
 
     error = PoseError.of(planned.pose, fit, others)
     notes = [*_notes(fit, comparison, others), *mirror_note]
+    if error.tilt_deg > _LEVELLED_DEG and _tilt_deg(Pose(0.0, 0.0, 0.0), fit.pose) < _LEVEL_DEG:
+        notes.append("the measured pose is exactly level: was the scan levelled? Export it in the sensor's own frame")
     score = _score_change(planned_sites.session, planned, fit.pose, comparison, notes)
     progress("scored", 3, steps)
     checks = tuple(_checks(error, comparison, score, limits))
@@ -413,12 +426,50 @@ def _register(
         comparison = scan_comparison.compare_scans(clouds, sensor, best.pose, world, max_vehicle_height_m)
         share = _structure(comparison) if _is_plausible(best, start) else 0.0
     if search is None or share < MIN_STRUCTURE_SHARE:
-        mirrored = [cloud * _MIRROR for cloud in clouds]
-        if _fitted_share(mirrored, sensor, start, surfaces, world) > max(share, _GOOD_STRUCTURE_SHARE):
-            raise _mirrored_error(where)
+        _check_frame(clouds, sensor, start, surfaces, world, where, max(share, _GOOD_STRUCTURE_SHARE))
         raise InputError(where, problem, hint)
     equally_good = [other.registration for other in search.equally_good]
     return best, comparison, tuple(other.pose.yaw_deg for other in equally_good if _is_near(other, start))
+
+
+class _OtherFrameError(InputError):
+    """A scan that fits in another frame than that of the sensor."""
+
+
+def _check_frame(
+    clouds: Sequence[FloatArray],
+    sensor: Sensor,
+    start: Pose,
+    surfaces: StaticSurfaces,
+    world: StaticWorld,
+    where: str,
+    least_share: float,
+) -> None:
+    """Raise an InputError that names the frame in which scans fit the static world, if one fits well."""
+    own_frame = "Export it in the sensor's own frame: x forward, y left, z along its axis, right-handed."
+    other_mount = "upright" if start.is_inverted else "inverted"
+    level = rotation_world_sensor(0.0, start.pitch_deg, start.roll_deg)
+    frames: list[tuple[FloatArray, str, str]] = [
+        (np.diag(_MIRROR), "better as its mirror image", _MIRROR_HINT),
+        (
+            np.diag([1.0, -1.0, -1.0]),
+            "turned by 180 degrees about its x axis: it is the other way up",
+            f"If the sensor hangs so, plan it with mount {other_mount}; if the file was turned: {own_frame}",
+        ),
+        (np.diag([1.0, 1.0, -1.0]), "with z reversed", own_frame),
+    ]
+    if start.pitch_deg or start.roll_deg:
+        frames.append((level, "at pitch 0 and roll 0: it was levelled", own_frame))
+    if start.is_inverted:
+        hung = rotation_world_sensor(0.0, start.pitch_deg, start.side_tilt_deg)
+        frames.append((hung @ np.diag([1.0, -1.0, -1.0]), "levelled and the other way up", own_frame))
+    shares = [
+        _fitted_share([cloud @ turn for cloud in clouds], sensor, start, surfaces, world) for turn, _, _ in frames
+    ]
+    best = int(np.argmax(shares))
+    if shares[best] > least_share:
+        _, how, hint = frames[best]
+        raise _OtherFrameError(where, f"the scan fits the static world {how}", hint)
 
 
 def _other_yaws(
@@ -470,8 +521,7 @@ def _check_not_mirrored(
 
 
 def _mirrored_error(where: str) -> InputError:
-    problem = "the scan fits the static world better as its mirror image"
-    return InputError(where, problem, "Export y to the left of x: azimuths count counter-clockwise from above.")
+    return InputError(where, "the scan fits the static world better as its mirror image", _MIRROR_HINT)
 
 
 def _check_fits_no_other_site(
@@ -483,16 +533,34 @@ def _check_fits_no_other_site(
     of the structure around the planned site with which the scans agree.
     """
     scene = planned_sites.session.scene
-    best_name, best_share = "", max(share + _OTHER_SITE_MARGIN, _GOOD_STRUCTURE_SHARE)
+    best: tuple[Site, Pose] | None = None
+    best_share = max(share + _OTHER_SITE_MARGIN, _GOOD_STRUCTURE_SHARE)
     for other in _sites_on_other_poles(planned_sites, planned):
         surfaces = StaticSurfaces(scene.world, other.pose.position_m)
         world = StaticWorld(scene, other.pose)
-        other_share = _fitted_share(clouds, planned_sites.sensor(other), other.pose, surfaces, world)
-        if other_share > best_share:
-            best_name, best_share = other.name, other_share
-    if best_name:
+        found = _best_fit(clouds, planned_sites.sensor(other), other.pose, surfaces, world)
+        if found is not None and found[0] > best_share:
+            best_share, best = found[0], (other, found[1])
+    if best is not None:
+        best_name = _closest_mount(planned_sites, *best)
         problem = f"this scan was not taken at {planned.name}; it fits {best_name}"
         raise InputError(where, problem, f"Use --site {best_name}, or the scan of {planned.name}.")
+
+
+def _closest_mount(planned_sites: PlannedSites, site: Site, measured: Pose) -> str:
+    """Return the site on the pole of another, of the plan if it has one there, whose pose is closest to a measured one.
+
+    A metre counts as much as 10 degrees.
+    """
+    names = list(planned_sites.plan) or list(planned_sites.session.candidates)
+    mounts = [other for other in map(planned_sites.site, names) if other.pole == site.pole]
+
+    def distance(other: Site) -> float:
+        turn = rotation_world_sensor(*measured.angles_deg).T @ rotation_world_sensor(*other.pose.angles_deg)
+        angle_deg = math.degrees(math.acos(min(max((float(np.trace(turn)) - 1.0) / 2.0, -1.0), 1.0)))
+        return _distance_m(measured, other.pose) + angle_deg / 10.0
+
+    return min(mounts, key=distance).name
 
 
 def _sites_on_other_poles(planned_sites: PlannedSites, planned: Site) -> list[Site]:
@@ -508,13 +576,21 @@ def _fitted_share(
     clouds: Sequence[FloatArray], sensor: Sensor, start: Pose, surfaces: StaticSurfaces, world: StaticWorld
 ) -> float:
     """Return how well scans agree with the structure of the static world at the best yaw; 0 if none is found."""
+    found = _best_fit(clouds, sensor, start, surfaces, world)
+    return 0.0 if found is None else found[0]
+
+
+def _best_fit(
+    clouds: Sequence[FloatArray], sensor: Sensor, start: Pose, surfaces: StaticSurfaces, world: StaticWorld
+) -> tuple[float, Pose] | None:
+    """Return how well scans agree with the structure of the static world at the best yaw, and the pose there."""
     try:
         fit = registration.search_yaw(np.concatenate(list(clouds)), surfaces, start).best
     except InputError:
-        return 0.0
+        return None
     if not _is_plausible(fit, start):
-        return 0.0
-    return _structure(scan_comparison.compare_scans(clouds, sensor, fit.pose, world))
+        return None
+    return _structure(scan_comparison.compare_scans(clouds, sensor, fit.pose, world)), fit.pose
 
 
 def _structure(comparison: ScanComparison) -> float:

@@ -159,7 +159,7 @@ class SheetData:
         tilt = f"{format_angle(abs(pose.pitch_deg))} {'up' if pose.pitch_deg > 0 else 'down'}"
         if pose.pitch_deg == 0:
             tilt = "0.0° (level)"
-        mount = "upside down, cable outlet down" if pose.is_inverted else "upright"
+        mount = "upside down, the base on top" if pose.is_inverted else "upright"
         side = describe_side_tilt(pose) or "0.0°"
         rows += [("Mount", mount), ("Tilt of the front", tilt), ("Roll", side)]
         return [*rows, ("Field of view", self._field_of_view)]

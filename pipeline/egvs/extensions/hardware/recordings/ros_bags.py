@@ -23,6 +23,7 @@ from egvs.formats.reader_process import Block, serve
 from egvs.formats.recording_options import RecordingOptions
 from egvs.formats.recordings import (
     RING_FIELDS,
+    TIME_FIELDS,
     RecordedSweep,
     Recording,
     chosen_sweeps,
@@ -36,7 +37,6 @@ _CANNOT_READ = "cannot be read as a recording of ROS"
 _TYPE = "sensor_msgs/msg/PointCloud2"
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy types by the datatype of a sensor_msgs/PointField."""
-_TIME_FIELDS = ("time", "timestamp", "t", "offset_time", "time_stamp")
 _NANO = 1e-9
 
 
@@ -150,7 +150,7 @@ def decode_points(message: Any) -> tuple[FloatArray, FloatArray | None, FloatArr
     points_m = np.column_stack([values for _, values in axes])
     rings = [column(name)[1] for name in RING_FIELDS if name in fields]
     ring = rings[0] if rings else None
-    name = next((name for name in _TIME_FIELDS if name in fields), None)
+    name = next((name for name in TIME_FIELDS if name in fields), None)
     if name is None:
         return points_m, None, ring
     dtype, time = column(name)

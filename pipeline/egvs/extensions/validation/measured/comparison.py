@@ -289,7 +289,7 @@ def compare_unlabelled(request: ComparisonRequest, scenario: Scenario | None = N
     """Return which returns of several sweeps of one place repeat; parameters and errors as :func:`compare_labelled`."""
     sweeps = _read_sweeps(request)
     sensor = sensor_site.find_sensor(request.sensor, scenario)
-    turned = sensor_site.is_inverted(sensor, scenario)
+    turned = sensor_site.is_inverted(request.sensor, scenario)
     return measure_repetition(sensor_site.on_ground_plane(sensor, sweeps, is_inverted=turned), sweeps)
 
 
@@ -307,7 +307,7 @@ def _find_site(request: ComparisonRequest, scenario: Scenario | None, sweeps: Se
     if request.site is not None:
         raise InputError("--site", "expected a scenario with this site, got none", "Name the scenario.")
     sensor = sensor_site.find_sensor(request.sensor, scenario)
-    return sensor_site.on_ground_plane(sensor, sweeps, is_inverted=sensor_site.is_inverted(sensor, scenario))
+    return sensor_site.on_ground_plane(sensor, sweeps, is_inverted=sensor_site.is_inverted(request.sensor, scenario))
 
 
 def return_model(site: SensorSite, scenario: Scenario | None) -> ReturnModel | None:

@@ -7,18 +7,24 @@ tilt. With a scenario, the pose is that of a site, and the world is that of the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.core import reading
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.wording import number_of
 from egvs.formats.sweep_files import Sweep
 from egvs.formats.sweep_labels import VCLASSES, SweepLabels
+from egvs.scenario.loading import format_validation_error
 from egvs.scenario.model import Scenario
+from egvs.scenario.sensor_config import SensorConfig
 from egvs.sensors.ground_plane import GroundPlane, find_ground_planes
 from egvs.sensors.sensor import Sensor, resolve_sensor, rotation_world_sensor, scenario_sensor
 from egvs.sensors.sites import Pose, Site
@@ -211,7 +217,7 @@ def in_scenario(scenario: Scenario, name: str | None, sensor: str | None) -> Sen
 
     scene = Inputs(scenario).plain_scene
     site = _choose(scene.sites, name)
-    chosen = scene.sensor(sensor or site.sensor, "--sensor" if sensor else f"site {site.name}")
+    chosen = find_sensor(sensor, scenario) if sensor else scene.sensor(site.sensor, f"site {site.name}")
     scan = Scanner(scene, full_sweep=True).scan(site.pose, chosen).rows
     range_m = np.sqrt((scan.ends_m**2).sum(axis=1))
     return SensorSite(
@@ -237,20 +243,49 @@ def _choose(sites: Sequence[Site], name: str | None) -> Site:
     return by_name[name]
 
 
-def is_inverted(sensor: Sensor, scenario: Scenario | None) -> bool:
-    """Return whether a scenario says that a sensor, or the sensors of all sites, hang upside down."""
-    if scenario is None:
-        return False
-    own = scenario.sensors.get(sensor.name)
-    return (scenario.sites.mount or ("upright" if own is None else own.mount)) == "inverted"
+def is_inverted(name: str | None, scenario: Scenario | None) -> bool:
+    """Return whether a sensor hangs upside down: by ``[sites]`` of a scenario, else by its own table."""
+    own = _custom_sensors(name, scenario).get(_name_in_file(name) or name or "")
+    sites_mount = None if scenario is None else scenario.sites.mount
+    return (sites_mount or ("upright" if own is None else own.mount)) == "inverted"
 
 
 def find_sensor(name: str | None, scenario: Scenario | None) -> Sensor:
-    """Return the sensor of sweeps that no site states; InputError for an unknown one, or none."""
+    """Return the sensor of sweeps that no site states, by its name or file; InputError for an unknown one, or none."""
     if name is None:
         problem = "expected the sensor of the sweeps, got none"
         hint = "Name one of egvs sensors, or one of [sensors] in a scenario; egvs sensor fit makes one of sweeps."
         raise InputError("--sensor", problem, hint)
+    in_file = _name_in_file(name)
+    if in_file is not None:
+        return resolve_sensor(in_file, _custom_sensors(name, None), "--sensor", lambda file: Path(name).parent / file)
     if scenario is not None:
         return scenario_sensor(name, scenario, "--sensor")
     return resolve_sensor(name, {}, "--sensor")
+
+
+def _name_in_file(name: str | None) -> str | None:
+    """Return the name of the only sensor of a file, such as that of egvs sensor fit; None if no file is named."""
+    if name is None or Path(name).suffix.lower() != ".toml":
+        return None
+    names = list(_custom_sensors(name, None))
+    if len(names) != 1:
+        raise InputError(name, f"expected one table [sensors.NAME], got {len(names)}", "Keep one, or use a scenario.")
+    return names[0]
+
+
+def _custom_sensors(name: str | None, scenario: Scenario | None) -> Mapping[str, SensorConfig]:
+    """Return the sensors of the file that is named, else those of a scenario."""
+    if name is None or Path(name).suffix.lower() != ".toml":
+        return {} if scenario is None else scenario.sensors
+    sensors = reading.read_toml(Path(name)).get("sensors", {})
+    if not isinstance(sensors, dict):
+        raise InputError(name, "expected a table [sensors.NAME], got another value", "Use the file of egvs sensor fit.")
+    return {key: _sensor_config(values, f"{name}: sensors.{key}") for key, values in sensors.items()}
+
+
+def _sensor_config(values: Any, where: str) -> SensorConfig:
+    try:
+        return SensorConfig.from_dict(values)
+    except ValidationError as error:
+        raise format_validation_error(error, where, SensorConfig) from None
