@@ -247,7 +247,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     "unknown edge": (["edge,count", "77,5"], r"line 2: edge: the network has no edge '77'"),
     "one edge": (["from_edge,to_edge,count", f"{FROM_NORTH},,5"], r"expected either edge, or from_edge and to_edge"),
     "edge and street": (["edge,street,count", f"{FROM_NORTH},North St,5"], r"names a street and an edge"),
-    "thousands": (["approach;count", "N;1.500"], r"line 2: count: 1.500 can mean 1500 or 1.5"),
+    "thousands": (["approach;count", "N;1.500"], r"line 2: count: 1.500 can mean 1.5 or 1500"),
     "underscore": (["approach,count", "N,1_0"], r"line 2: count: expected a number of vehicles"),
     "few values": ([HEAD, ",N,left,5"], r"line 2: expected 5 values, got 4"),
     "quotes": ([HEAD, '"N"x,,,,5'], r"is not CSV"),

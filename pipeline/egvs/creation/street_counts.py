@@ -29,7 +29,7 @@ from typing import Any
 import tomlkit
 
 from egvs.core.errors import InputError, parse_each
-from egvs.core.numbers import number_or_nan, parse_decimal
+from egvs.core.numbers import ambiguous_number, number_or_nan, parse_decimal
 from egvs.core.table_columns import parse_header
 from egvs.core.wording import list_first, number_of
 from egvs.creation import junctions, scenario_files
@@ -43,7 +43,6 @@ LOCATION_COLUMNS = ("street", "approach", "turn", "lane_group", "edge", "from_ed
 VALUE_COLUMNS = ("start", "minutes", "count", "kind")
 
 _CLOCK = re.compile(r"([01]?\d|2[0-3])[:.h]?([0-5]\d)(:00)?")
-_THOUSANDS = re.compile(r"[1-9][0-9]{0,2}\.[0-9]{3}")
 _INTERVALS_MIN = (5, 10, 15, 20, 30, 60)
 _MAX_COUNT = 100_000.0
 _MAX_NAMED = 4
@@ -419,9 +418,8 @@ def _parse_clock(where: str, text: str) -> int:
 
 def _parse_count(where: str, text: str) -> float:
     value = number_or_nan(text, parse_decimal)
-    if _THOUSANDS.fullmatch(text):
-        problem = f"{text} can mean {text.replace('.', '')} or {value:g}"
-        raise InputError(where, problem, "Use no separators of thousands.")
+    if choices := ambiguous_number(text):
+        raise InputError(where, f"{text} can mean {choices}", f"Write {choices}.")
     if not 0 <= value <= _MAX_COUNT:
         problem = f"expected a number of vehicles of 0 to {_MAX_COUNT:,.0f}, got {text!r}"
         raise InputError(where, problem, "Use a number such as 120.")

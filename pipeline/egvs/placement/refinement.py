@@ -280,7 +280,7 @@ def sensor_freedoms(
         freedoms.append(freedom if freedom is not None and freedom.axes else None)
     if not any(freedoms):
         raise InputError(
-            f"{scenario.file}: placement.refine",
+            scenario.locate("placement.refine"),
             "no sensor of the plan can move",
             "Set a range of heights or angles, or use sensors that are neither forced nor measured.",
         )

@@ -486,6 +486,11 @@ class Scenario(StrictModel):
         """The scenario file, for messages."""
         return self.folder / self._file_name
 
+    def locate(self, key: str) -> str:
+        """Return where a key is, for errors: the command line for one that it sets, else the file."""
+        is_set = any(f"{key}.".startswith(f"{name}.") or name.startswith(f"{key}.") for name in self._overrides)
+        return f"command line: {key}" if is_set else f"{self.file}: {key}"
+
     def with_effects(self, effects: EffectsConfig) -> Scenario:
         """Return the same scenario with other effects; gamma keeps its number, even if it was "auto"."""
         score = self.score.model_copy(update={"gamma": self.gamma})
@@ -510,7 +515,7 @@ class Scenario(StrictModel):
         InputError
             When there is no such file, or it cannot be read.
         """
-        where = f"{self.file}: {key} = {name!r}"
+        where = f"{self.locate(key)} = {name!r}"
         if len(name) > _MAX_NAME_LENGTH:
             raise InputError(where, f"the path is longer than {_MAX_NAME_LENGTH} characters")
         folders = (sumo_home(),) if name.startswith(_SUMO_HOME_PREFIX) else self._folders

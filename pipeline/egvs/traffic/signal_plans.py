@@ -112,7 +112,7 @@ def _programs(scenario: Scenario, path: Path, roads: network.Network) -> dict[st
     signals = read_signals(path, roads)
     programs: dict[str, Program] = {}
     for name, config in scenario.traffic.signals.items():
-        where = f"{scenario.file}: traffic.signals.{name}"
+        where = scenario.locate(f"traffic.signals.{name}")
         signal = find_signal(name, signals, where)
         if signal.id in programs:
             raise InputError(where, f"the signal {signal.title} has two plans", "Remove one of them.")

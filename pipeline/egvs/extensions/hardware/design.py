@@ -343,7 +343,7 @@ class _Designer:
             weight = weight * target_weights(config.weights, weight_zones(self._context.scenario), record)
         if not math.fsum(weight) > 0.0:
             problem = f"no vehicle is in the region of interest in the {which} half of the frames"
-            raise InputError(f"{self._context.scenario.file}: traffic.frames", problem, "Record more frames.")
+            raise InputError(self._context.scenario.locate("traffic.frames"), problem, "Record more frames.")
         return _Half(record, weight)
 
     def best_mount(self, sensor: Sensor, number: int) -> _Trial:
