@@ -184,6 +184,7 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
     """Print the fitted values, the ground planes, and the files."""
     from egvs.cli.console import WIDE, Column, console, make_table
     from egvs.extensions.hardware.fit.output import calibration_lines
+    from egvs.sensors.sites import Pose
 
     out = console(WIDE)
     angles = result.angles
@@ -231,7 +232,7 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
     columns: list[Column[int]] = [
         Column("ground plane", lambda i: f"{i + 1}{' (chosen)' if planes[i] is result.plane else ''}", "left"),
         Column("below the sensor", lambda i: f"{planes[i].height_m:.2f} +- {planes[i].height_se_m:.2f} m"),
-        Column("roll", lambda i: f"{planes[i].roll_deg:.2f} deg"),
+        Column("roll", lambda i: f"{Pose(0.0, 0.0, 0.0, roll_deg=planes[i].roll_deg).side_tilt_deg:z.2f} deg"),
         Column("pitch", lambda i: f"{planes[i].pitch_deg:.2f} deg"),
         Column("returns", lambda i: f"{planes[i].returns:,}"),
         Column("roughness", lambda i: f"{planes[i].roughness_m:.2f} m"),
@@ -239,6 +240,8 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
         Column("y", lambda i: f"{planes[i].y_m[0]:.0f} to {planes[i].y_m[1]:.0f} m"),
     ]
     out.print(make_table(columns, range(len(planes))))
+    if result.plane.is_inverted:
+        out.print('The sensor is upside down (mount = "inverted" in sensor.toml); its roll counts from there.')
     out.print(f"Check in {written.folder / 'ground.png'} that the chosen plane is the road; if not, use --ground N.")
     if result.calibrated_pose is not None:
         for line in calibration_lines(result.calibrated_pose):
