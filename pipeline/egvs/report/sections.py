@@ -87,7 +87,7 @@ _BY_IMPORTANCE = (
 
 
 _LONG = 75
-"""Longer lists of assumptions leave out what is in brackets, except sides of approaches, and all but the first of a list."""
+"""Longer lists of assumptions leave out what is in brackets, except sides of approaches, and name one of several."""
 
 
 def main_assumptions(assumed: Sequence[str], count: int = 2) -> str:
