@@ -552,12 +552,13 @@ def test_rule_that_forbids_one_more_is_named(five_candidates: Path, out: Path, r
     assert run_egvs("run", five_candidates, "--out", out, *rules)[0] == 0
     code, text, error = run_egvs("place", five_candidates, "--out", out, "--count", 3, *rules)
     assert code == 0, error
-    assert "most_per_pole = 1 forbids a third sensor beside them." in text and "adds nothing" not in text
-    assert "most_per_pole = 1 forbids a third sensor beside them." in (out / "report.html").read_text()
+    sentence = "The limit of 1 sensor per pole (most_per_pole) forbids a third sensor beside them."
+    assert sentence in text and "adds nothing" not in text
+    assert sentence in (out / "report.html").read_text()
     plan = egvs.open_session(out).plan
     assert plan is not None and len(plan.sites) == 2
-    assert (plan.best_next, plan.forbids_more) == (None, "most_per_pole = 1")
+    assert (plan.best_next, plan.forbids_more) == (None, "the limit of 1 sensor per pole (most_per_pole)")
 
     apart = ("--set", "placement.least_distance_m=1000")
     _, text, _ = run_egvs("place", five_candidates, "--out", out / "apart", "--count", 3, *apart)
-    assert "least_distance_m = 1000 forbids a second sensor beside it." in text
+    assert "The distance of 1000 m (least_distance_m) forbids a second sensor beside it." in text

@@ -300,7 +300,7 @@ def _mount_columns(sites: Sequence[RankedSite], poles: Sequence[Pole]) -> list[C
         columns.append(Column("sensor", lambda pole: pole.best.sensor, "left"))
     columns.append(Column("z m", lambda pole: f"{pole.best.z_m:.4g}"))
     if any(site.yaw_deg or site.pitch_deg for site in sites):
-        columns.append(Column("yaw deg", lambda pole: f"{pole.best.yaw_deg:.0f}"))
+        columns.append(Column("ccw yaw deg", lambda pole: f"{pole.best.yaw_deg:.0f}"))
         columns.append(Column("pitch deg", lambda pole: f"{pole.best.pitch_deg:z.0f}"))
     return columns
 

@@ -258,7 +258,7 @@ def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
         Column("pole", lambda pole: pole.name, "left", wrap=True),
         Column("best candidate", lambda pole: pole.best.site, "left", wrap=True),
         Column("z m", lambda pole: f"{pole.best.z_m:g}"),
-        Column("yaw deg", lambda pole: f"{pole.best.yaw_deg:.1f}"),
+        Column("ccw yaw deg", lambda pole: f"{pole.best.yaw_deg:.1f}"),
         Column("pitch deg", lambda pole: f"{pole.best.pitch_deg:z.1f}"),
         Column(by.head, lambda pole: _format_score(by, pole.best)),
         Column("candidates", lambda pole: str(len(pole.sites))),
