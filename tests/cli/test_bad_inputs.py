@@ -209,6 +209,15 @@ BAD: dict[str, tuple[Change, str]] = {
         put("sites.csv", "site;x_m;y_m;z_m\na;1,500;12;3\n"),
         r"sites.csv: line 2: x_m: 1,500 can mean 1500 or 1.500. Use no separators of thousands",
     ),
+    "sites with costs in thousands": (
+        sites("a,1,12,3,8.000", "b,1,14,3,950", head="site,x_m,y_m,z_m,cost"),
+        r"sites.csv: line 2 \(a\): cost: 8.000 can mean 8 or 8000. Write 8 or 8000.",
+    ),
+    "sites from the middle of the region": (
+        put("sites.csv", "site,x_m,y_m,z_m\na,3.1,8.7,4\n", edit("center_m = [20, 0,", "center_m = [420, 395,")),
+        r"the site is .* Move it within .* The middle of the region is at x 420, y 395: add it to positions that count"
+        r" from there. Longitude and latitude belong in columns longitude and latitude.",
+    ),
     "sites with bars": (put("sites.csv", "site|x_m|y_m|z_m\n"), r"sites.csv: the columns are separated by '\|'"),
     "sites ragged": (sites("a,1,12"), r"line 2: expected 4 values, got 3"),
     "site twice": (sites("a,1,12,3", "a,2,12,3"), r"there are two sites 'a'"),
@@ -342,9 +351,21 @@ COMMANDS = {
     ),
     "--budget 30.000": (
         ["place", "{mini}", "--budget", "30.000"],
-        r"^egvs: --budget: 30.000 can be 30 or 30000. Write 30 or 30000.$",
+        r"^egvs: --budget: 30.000 can mean 30 or 30000. Write 30 or 30000.$",
     ),
-    "--surroundings 1,500": (["new", "{out}", "--osm", "x", "--surroundings", "1,500"], r"1,500 can be 1.5 or 1500"),
+    "--set placement.budget=30.000": (
+        ["place", "{mini}", "--set", "placement.budget=30.000"],
+        r"^egvs: --set: placement.budget: 30.000 can mean 30 or 30000. Write 30 or 30000.$",
+    ),
+    "--set of a price": (
+        ["check", "{mini}", "--set", 'costs.sensor={{"VLP-32C" = 8.450}}'],
+        r"^egvs: --set: costs.sensor.VLP-32C: 8.450 can mean 8.45 or 8450. Write 8.45 or 8450.$",
+    ),
+    "--set of a budget without costs": (
+        ["place", "{mini}", "--set", "placement.budget=30"],
+        r"^egvs: command line: placement.budget: the cost of site \w+ is unknown",
+    ),
+    "--surroundings 1,500": (["new", "{out}", "--osm", "x", "--surroundings", "1,500"], r"1,500 can mean 1.5 or 1500"),
     "--reach in per cent": (["place", "{mini}", "--reach", "95"], r"^egvs: --reach: .* got 95. Use 0.95 for 95 %"),
     "--reach below 0": (["place", "{mini}", "--reach", "-1"], r"^egvs: --reach: .* got -1. Use a share such as 0.95"),
     "--set without value": (["run", "{mini}", "--set", "roi.voxel_m"], r"--set roi.voxel_m: expected KEY=VALUE"),

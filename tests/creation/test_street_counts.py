@@ -65,6 +65,31 @@ def test_same_movement_by_any_of_its_names(location: str, read: Read) -> None:
     assert rates(counts) == {(FROM_NORTH, TO_EAST): 120.0}  # a left turn of a southbound vehicle leads east
 
 
+def test_german_tables_mean_the_same(read: Read) -> None:
+    """As counting offices in Germany write them, with a name for each side and turn."""
+    german = read(
+        "Straße;Zufahrt;Richtung;Beginn;Anzahl",
+        "North Str.;Nord;links;07:00;10",
+        ";Süd;Geradeaus;07:00;20",
+        ";aus Osten;Rechtsabbieger;07:00;5",
+        ";Sued;rechts;07:00;7",
+        ";north st (Nord);rechts;07:00;3",
+        "East Str.;O;g;07:00;9",
+        ";N;geradeaus;07:15;1",
+    )
+    english = read(
+        "street,approach,turn,start,count",
+        "North Street,N,left,07:00,10",
+        ",S,through,07:00,20",
+        ",E,right,07:00,5",
+        ",S,right,07:00,7",
+        ",N,right,07:00,3",
+        ",E,through,07:00,9",
+        ",N,straight,07:15,1",
+    )
+    assert (german.hours, german.notes) == (english.hours, english.notes)
+
+
 @pytest.mark.parametrize(
     ("group", "expected"),
     [("SBL", (FROM_NORTH, TO_EAST)), ("NBT", (FROM_SOUTH, TO_NORTH)), ("ebr", (FROM_WEST, TO_SOUTH))],
@@ -172,14 +197,20 @@ def test_counts_of_one_hour_are_no_period(tmp_path: Path, run_egvs: Any) -> None
 
 
 # --- bad input -------------------------------------------------------------------------------------------------------
+TURNS = r"\(left, right, straight\)"
 NAMES = (
-    r"The approaches are: North Street \(north\), East Street \(east\), North Street \(south\), East Street \(west\)\."
+    rf"The approaches are: North Street \(north\) {TURNS}; East Street \(east\) {TURNS};"
+    rf" North Street \(south\) {TURNS}; East Street \(west\) {TURNS}\."
 )
 HEAD = "street,approach,turn,start,count"
 BAD: dict[str, tuple[list[str], str]] = {
     "empty": ([""], r"expected a header and rows, got no values"),
     "no rows": ([HEAD], r"counts.csv: has no counts"),
     "unknown column": (["street,aproach,count", "a,N,1"], r"header: unknown column 'aproach'. Did you mean approach\?"),
+    "unknown columns": (
+        ["Straße,Arm,Farbe,Anzahl", "a,N,rot,1"],
+        r"header: unknown columns 'Arm', 'Farbe'. Columns: street, approach, turn, lane_group",
+    ),
     "two columns": (["street,street,count", "a,b,1"], r"two columns are called 'street'"),
     "no number": (["street,approach", "a,N"], r"expected a column count, or columns named by their start, got none"),
     "both": (["approach,count,07:00", "N,1,1"], r"got both"),
@@ -194,7 +225,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     "unknown side": ([HEAD, ",up,left,,5"], r"line 2: approach: expected the side on which vehicles arrive, got 'up'"),
     "between two": ([HEAD, ",NE,left,,5"], r"'from the north-east' may be"),
     "unknown turn": ([HEAD, ",N,sideways,,5"], r"line 2: turn: expected left, straight, right, U-turn or all"),
-    "no such turn": ([HEAD, ",N,u-turn,,5"], r"North Street .* has no movement U-turn\. Its turns are: left, right"),
+    "no such turn": ([HEAD, ",N,u-turn,,5"], rf"North Street .* has no movement U-turn\. {NAMES}"),
     "unknown group": (["lane_group,count", "XBL,5"], r"line 2: lane_group: expected a lane group such as NBL or EBTR"),
     "negative": ([HEAD, ",N,left,,-5"], r"line 2: count: expected a number of vehicles of 0 to 100,000, got '-5'"),
     "text": ([HEAD, ",N,left,,many"], r"count: expected a number of vehicles .* got 'many'"),
@@ -216,7 +247,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     "unknown edge": (["edge,count", "77,5"], r"line 2: edge: the network has no edge '77'"),
     "one edge": (["from_edge,to_edge,count", f"{FROM_NORTH},,5"], r"expected either edge, or from_edge and to_edge"),
     "edge and street": (["edge,street,count", f"{FROM_NORTH},North St,5"], r"names a street and an edge"),
-    "thousands": (["approach;count", "N;1.500"], r"line 2: count: 1.500 can mean 1500 or 1.5"),
+    "thousands": (["approach;count", "N;1.500"], r"line 2: count: 1.500 can mean 1.5 or 1500"),
     "underscore": (["approach,count", "N,1_0"], r"line 2: count: expected a number of vehicles"),
     "few values": ([HEAD, ",N,left,5"], r"line 2: expected 5 values, got 4"),
     "quotes": ([HEAD, '"N"x,,,,5'], r"is not CSV"),

@@ -230,6 +230,7 @@ def test_edited_tables_are_used_and_stay(made_scenario: Path, tmp_path: Path) ->
         ("from_edge,to_edge,count\na,b,many\n", "line 2: count: expected vehicles per hour, got 'many'"),
         ("from_edge,to_edge\na,b\n", "the column 'count' is missing"),
         ("from_edge,to_edge,count,colour\na,b,3,red\n", "unknown column 'colour'"),
+        ("from_edge,to_edge,Anzahl,colour,age\na,b,3,red,1\n", "unknown columns 'colour', 'age'"),
         (None, "traffic.counts: no such file"),
     ],
 )

@@ -91,9 +91,18 @@ def test_commas_in_other_texts_stay(tmp_path: Path) -> None:
         (b"a;b\n1;2,5\n1;1.500\n", r"t.csv: line 3: b: 1.500 can mean 1500 or 1.500"),
         (
             b"Sites of the town,,\n,,\na,b\n1,2\n",
-            r"t.csv: line 1: .* got 'Sites of the town' alone. Remove",
+            r"t.csv: line 1: .* got 'Sites of the town'. Remove what is above the names \(line 3\?\)",
         ),
-        (b"# by hand\na,b\n1,2\n", r"t.csv: line 1: expected the names of the columns, got '# by hand' alone"),
+        (b"# by hand\na,b\n1,2\n", r"t.csv: line 1: expected the names of the columns, got '# by hand'"),
+        (
+            b"Count of 12 May;Knoten 5;;;\n;;;;\nBearbeiter;Meier;;;\n;;;;\n"
+            b"Street;Arm;Abbieger;Start;Count\nA;N;left;07:00;5\n",
+            r"t.csv: line 1: expected the names of the columns, got 'Count of 12 May'. Remove .* \(line 5\?\)",
+        ),
+        (
+            b"Crossing, north side\nMeier\n\na;b\n1;2\n",
+            r"t.csv: line 1: .* got 'Crossing, north side'. .* \(line 4\?\)",
+        ),
         (b"<html><table><tr><td>a</td></tr></table></html>", r"t.csv: expected a table, got HTML or XML"),
         (b'<?xml version="1.0"?><Workbook/>', r"t.csv: expected a table, got HTML or XML"),
         (b"", r"t.csv: expected a header and rows, got no values"),

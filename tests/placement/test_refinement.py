@@ -283,6 +283,31 @@ def test_sensor_turns_and_tilts_at_fixed_pole(mini: Path) -> None:
     assert freedom.pose_at(np.array([0.5, 1.75, 0.25])) == Pose(10, 12, 4.0, 90.0, -20.0, 0.0)
 
 
+@pytest.mark.parametrize(
+    ("roll_deg", "at_low", "at_high"), [(0.0, -5.0, 15.0), (180.0, 175.0, -165.0), (-178.5, 175.0, -165.0)]
+)
+def test_limits_of_roll_count_from_the_mount(mini: Path, roll_deg: float, at_low: float, at_high: float) -> None:
+    config = RefinementConfig(roll_deg=(-5.0, 15.0), yaw_deg=(0.0, 0.0), pitch_deg=(0.0, 0.0))
+    site = make_site("a", 10, 12, roll_deg=roll_deg)
+    freedom = find_freedom(mini, config, site)
+    assert [axis.name for axis in freedom.axes] == ["roll_deg"]
+    assert freedom.pose_at(freedom.point(site.pose)) == site.pose
+    ends = [freedom.pose_at(np.array([share])) for share in (0.0, 1.0)]
+    assert [pose and pose.roll_deg for pose in ends] == [at_low, at_high]
+
+
+@pytest.mark.parametrize("settings", [(), ("placement.refine.roll_deg=[-10, 10]",)])
+def test_refined_sensor_stays_upside_down(mini: Path, run_egvs, settings: tuple[str, ...]) -> None:
+    keys = ["sites.mount=inverted", "sites.roll_deg=2", "placement.refine.evaluations=20", *settings]
+    options = [word for key in keys for word in ("--set", key)]
+    code, printed, error = run_egvs("place", mini, "--count", 1, "--refine", *options, "--out", mini / "run")
+    assert code == 0, error
+    (roll_deg,) = pq.read_table(mini / "run" / "placement.parquet").column("roll_deg").to_pylist()
+    assert abs(roll_deg) > 165.0
+    assert settings or roll_deg == -178.0
+    assert "upside down" in printed
+
+
 def test_pose_outside_ranges_begins_at_nearest_end(mini: Path) -> None:
     tilted = make_site("a", 10, 12, pitch_deg=-45.0, yaw_deg=270.0)
     freedom = find_freedom(mini, RefinementConfig(), tilted, make_site("b", 30, -12, 5.0))

@@ -8,6 +8,7 @@ import pytest
 
 import egvs
 from egvs.core.errors import InputError
+from egvs.scenario import loading
 from egvs.scenario.model import Scenario
 
 BASE = """
@@ -150,3 +151,31 @@ def test_scenario_without_polygons_takes_over_no_keys_of_polygons(mini: Path) ->
     (mini / "child" / "scenario.toml").write_text('extends = ".."\n[statics]\npolygons = []\n')
     assert egvs.load(mini).statics.polygon_types == {"building": 3.0}
     assert egvs.load(mini / "child").statics.polygon_types == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "choices"),
+    [
+        ("[placement]\nbudget = 30.000", "placement.budget: 30.000", "30 or 30000"),
+        ('[costs]\nsensor = { "VLP-32C" = 8.000 }', "costs.sensor.VLP-32C: 8.000", "8 or 8000"),
+        ("[costs]\nmetre = 12.345", "costs.metre: 12.345", "12.3450 or 12345"),
+    ],
+)
+def test_costs_whose_point_may_separate_thousands_are_asked_about(
+    mini: Path, text: str, key: str, choices: str
+) -> None:
+    file = mini / "scenario.toml"
+    scenario = file.read_text()
+    file.write_text(f"{scenario}\n{text}\n")
+    with pytest.raises(InputError, match=f"scenario.toml: {key} can mean {choices}. Write {choices}."):
+        loading.load(mini)
+    file.write_text(f"{scenario}\n[costs]\nsensor = {{ VLP-32C = 8000 }}\nmetre = 12.3450\npole = 0.125\n")
+    assert loading.load(mini, ["placement.budget=30.0"]).costs.metre == 12.345
+
+
+def test_errors_name_the_command_line_for_keys_that_it_sets(mini: Path) -> None:
+    scenario = loading.load(mini, ["placement.budget=30", "sites.file=poles.csv"])
+    assert scenario.locate("placement.budget") == "command line: placement.budget"
+    assert scenario.locate("placement.count") == f"{mini / 'scenario.toml'}: placement.count"
+    with pytest.raises(InputError, match=r"^command line: sites.file = 'poles.csv': no such file"):
+        scenario.find("poles.csv", "sites.file")

@@ -75,6 +75,25 @@ def test_threads_and_other_processes_get_the_same(run):
     assert [again.score(scan) for scan in scans] == alone
 
 
+def test_rejects_tpog_of_another_region(mini, tmp_path):
+    scenario = egvs.load(mini)
+    egvs.run(scenario, tmp_path / "run")
+    tpog = egvs.read_tpog(tmp_path / "run" / "tpog.parquet")
+    for change in ("roi.voxel_m=1.0", "roi.center_m=[21, 10, 2.5]"):
+        with pytest.raises(InputError, match=r"^tpog: its Grid\(.* is not that of the scene, Grid\("):
+            Scorer(egvs.build_scene(egvs.load(mini, [change])), tpog)
+
+
+def test_names_the_call_that_makes_an_argument(mini):
+    scene = egvs.build_scene(egvs.load(mini))
+    with pytest.raises(InputError, match=r"^scene: expected a Scene, got PosixPath .*egvs\.build_scene\(scenario\)"):
+        Scanner(mini)
+    with pytest.raises(InputError, match=r"^tpog: expected a Tpog, got str 'tpog.parquet'.*egvs\.read_tpog\(path\)"):
+        Scorer(scene, "tpog.parquet")
+    with pytest.raises(InputError, match=r"^sensor: expected a Sensor, got str 'small'\. Use scene\.sensor\('small'\)"):
+        Scanner(scene).scan(Pose(8.0, 14.0, 3.0), "small")
+
+
 def test_traffic_to_replay_must_be_named(mini, tmp_path):
     scenario = egvs.load(mini, [OCCLUSION])
     egvs.run(scenario, tmp_path)

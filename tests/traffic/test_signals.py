@@ -295,7 +295,7 @@ WRONG = [
     ({"c": {"phases": [NS, EW | {"green": {"Mill Lane": ["all"]}}]}},
      r"approach 'Mill Lane' may be 'Mill Lane \(north\)' or 'Mill Lane \(south\)'. Use the full name"),
     ({"c": {"phases": [NS | {"green": {"north": ["sideways"]}}, EW]}},
-     "approach 'north' has no movement 'sideways'. Its movements are: right, straight, left, crosswalk"),
+     r"approach 'north' has no movement 'sideways'. Its approaches are: Mill Lane \(north\) \(right, straight, left"),
     ({"c": {"phases": [NS | {"green": {"north": ["straight"], "east": ["straight"]}}]}},
      r"phase 1: Mill Lane \(north\) straight and High Street \(east\) straight conflict, but both have green"),
     ({"c": {"phases": [NS | {"green": {"north": ["left"], "east": ["straight"]}}]}}, "conflict, but both have green"),
@@ -335,6 +335,15 @@ def test_rejects_contradictory_keys(plan, message):
 CSV = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\nb,east,all,20\nb,west,all,20\n"
 
 
+def test_german_table_gives_the_same_program(crossing, tmp_path):
+    shutil.copy(crossing / "net.net.xml", tmp_path)
+    (tmp_path / "plan.csv").write_text(CSV)
+    rows = ["Phase;Zufahrt;Richtung;Grün", "a;mill ln. (Nord);links geradeaus rechts;30", "a;S;alle;30"]
+    (tmp_path / "plan_de.csv").write_text("\n".join([*rows, "b;Ost;alle;20", "b;HIGH-STREET (W);alle;20"]) + "\n")
+    expected, german = (programs(tmp_path, {"c": {"file": name}})["c"] for name in ("plan.csv", "plan_de.csv"))
+    assert german == expected
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -345,6 +354,7 @@ CSV = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\nb,east,a
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all,often"), "line 4: green_s: expected seconds, got 'often'"),
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all"), "line 4: expected 4 values, got 3"),
         ("p.csv", CSV.replace("green_s", "green_s,colour").replace("0\n", "0,red\n"), "unknown column 'colour'"),
+        ("p.csv", CSV.replace("movement", "movment").replace("approach", "Ort"), "unknown columns 'Ort', 'movment'"),
         *(
             ("p.add.xml", f'<additional><tlLogic id="c"><phase duration="{text}" state="GG"/></tlLogic></additional>',
              f"invalid <tlLogic> (ValueError(\"duration = '{text}': expected seconds, above 0\"))")

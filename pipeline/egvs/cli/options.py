@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperCommand
 
 from egvs.core.errors import InputError
-from egvs.core.numbers import number_or_nan
+from egvs.core.numbers import ambiguous_number, number_or_nan
 
 ScenarioPath = Annotated[
     Path,
@@ -177,10 +177,8 @@ def cost(text: str) -> float:
 
 def _check_separators(text: str, option: str) -> None:
     """Raise an InputError where a point or comma can separate thousands or decimals, as in 30.000."""
-    if re.fullmatch(r"[1-9][0-9]{0,2}[.,][0-9]{3}[A-Za-z]*", text):
-        short = re.sub(r"\.?0+(?=[A-Za-z]*$)", "", text.replace(",", "."))
-        choices = f"{short} or {re.sub('[.,]', '', text)}"
-        raise InputError(option, f"{text} can be {choices}", f"Write {choices}.")
+    if choices := ambiguous_number(text):
+        raise InputError(option, f"{text} can mean {choices}", f"Write {choices}.")
 
 
 def width_mm(text: str, least: float, most: float) -> float:

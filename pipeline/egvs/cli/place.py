@@ -234,8 +234,12 @@ def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
 
 def _sensor_table(placed: SensorPlan, width: int) -> Table:
     from egvs.cli.console import Column, make_table
+    from egvs.results.ranking import describe_roll
 
     by, head = placed.by, partial(_head, width)
+    rolls: list[Column[PlannedSensor]] = []
+    if any(row.roll_deg for row in placed.sensors):
+        rolls.append(Column("roll", lambda row: describe_roll(row.roll_deg), "left", wrap=True))
     columns: list[Column[PlannedSensor]] = [
         Column("", lambda row: row.marked_order),
         Column("site", lambda row: row.site, "left", wrap=True)
@@ -245,6 +249,7 @@ def _sensor_table(placed: SensorPlan, width: int) -> Table:
         Column(head("ccw yaw deg"), lambda row: f"{row.yaw_deg:.1f}"),
         Column(head("pitch deg"), lambda row: f"{row.pitch_deg:z.1f}"),
         Column("sensor", lambda row: row.sensor, "left"),
+        *rolls,
         Column(head("adds", by.change_head), lambda row: by.change(row.gain, row.gain_se)),
         Column(head(_together_head(by)), lambda row: by.with_error(row.score, row.score_se)),
         Column(head("lost if it fails", by.change_head), lambda row: by.change(row.loss)),

@@ -73,6 +73,13 @@ class InputError(EgvsError):
         return InputError, (self.where, self.problem, self.hint)  # for another process
 
 
+def check_instance(name: str, value: object, kind: type, source: str) -> None:
+    """Raise an InputError if an argument is not of a class; ``source`` is the expression that makes one."""
+    if not isinstance(value, kind):
+        got = f"{type(value).__name__} {value!r}"
+        raise InputError(name, f"expected a {kind.__name__}, got {truncate_text(got)}", f"Use {source}.")
+
+
 class RunError(EgvsError):
     """The input is valid, but the run could not do what it asks for (for example: N vehicles in every frame)."""
 

@@ -1,8 +1,9 @@
-"""Parse numbers in texts: decimal numbers in ASCII, or NaN."""
+"""Parse numbers in texts: decimal numbers in ASCII, or NaN; numbers whose point may separate thousands."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 
 
@@ -44,3 +45,26 @@ def number_or_nan(text: str, parse: Callable[[str], float] = float) -> float:
         return parse(text)
     except ValueError:
         return math.nan
+
+
+def ambiguous_number(text: str) -> str:
+    """Return both numbers that a text with three decimals can be, with its unit; empty if it can be only one.
+
+    Examples
+    --------
+    >>> ambiguous_number("30.000"), ambiguous_number("1,234m"), ambiguous_number("30.00"), ambiguous_number("0.125")
+    ('30 or 30000', '1.2340m or 1234m', '', '')
+    """
+    match = re.fullmatch(r"([1-9][0-9]{0,2})[.,]([0-9]{3})([A-Za-z]*)", text)
+    if match is None:
+        return ""
+    whole, decimals, unit = match.groups()
+    number = f"{whole}.{decimals}"
+    number = f"{number}0" if decimals[-1] != "0" else number.rstrip("0").rstrip(".")
+    return f"{number}{unit} or {whole}{decimals}{unit}"
+
+
+class WrittenNumber(float):
+    """A number of a file that :func:`ambiguous_number` reads in two ways; ``text`` is how it is written."""
+
+    text: str

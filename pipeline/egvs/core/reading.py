@@ -21,6 +21,7 @@ from typing import Any
 from egvs.core import limits
 from egvs.core.errors import EgvsError, InputError
 from egvs.core.files import DISK_FULL_ERRNOS
+from egvs.core.numbers import WrittenNumber, ambiguous_number
 
 COMPLETE_FILE = "Download or make the file again; it may be incomplete."
 """Hint for a file that cannot be read."""
@@ -113,7 +114,8 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file; InputError when it is not valid."""
     data = limits.read_bytes(path, limits.DOCUMENT)
     try:
-        values = tomllib.loads(data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n"))
+        text = data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+        values = tomllib.loads(text, parse_float=_parse_float)
         check_depth(values)
         _check_digits(values)
     except (ValueError, RecursionError, MemoryError) as error:
@@ -123,9 +125,15 @@ def read_toml(path: Path) -> dict[str, Any]:
     return values
 
 
+def _parse_float(text: str) -> float:
+    number = WrittenNumber(text)
+    number.text = text
+    return number if ambiguous_number(text) else float(text)
+
+
 def parse_toml_value(text: str) -> Any:
     """Parse a single TOML value; ValueError when it is not valid."""
-    value = tomllib.loads(f"v = {text}")["v"]
+    value = tomllib.loads(f"v = {text}", parse_float=_parse_float)["v"]
     check_depth(value)
     _check_digits(value)
     return value

@@ -28,8 +28,9 @@ from typing import Any
 
 import tomlkit
 
-from egvs.core.errors import InputError, find_misspelling, parse_each
-from egvs.core.numbers import number_or_nan, parse_decimal
+from egvs.core.errors import InputError, parse_each
+from egvs.core.numbers import ambiguous_number, number_or_nan, parse_decimal
+from egvs.core.table_columns import parse_header
 from egvs.core.wording import list_first, number_of
 from egvs.creation import junctions, scenario_files
 from egvs.creation.junctions import StreetJunction, Streets
@@ -42,11 +43,10 @@ LOCATION_COLUMNS = ("street", "approach", "turn", "lane_group", "edge", "from_ed
 VALUE_COLUMNS = ("start", "minutes", "count", "kind")
 
 _CLOCK = re.compile(r"([01]?\d|2[0-3])[:.h]?([0-5]\d)(:00)?")
-_THOUSANDS = re.compile(r"[1-9][0-9]{0,2}\.[0-9]{3}")
 _INTERVALS_MIN = (5, 10, 15, 20, 30, 60)
 _MAX_COUNT = 100_000.0
 _MAX_NAMED = 4
-_ALL_TURNS = ("", "all", "total", "any")
+_ALL_TURNS = ("", "all", "total", "any", "alle", "gesamt")
 
 
 @dataclass(frozen=True)
@@ -314,14 +314,10 @@ def _read_rows(path: Path, index: ApproachIndex, edges: frozenset[str], kinds: f
 
 def _check_header(path: Path, header: list[str]) -> list[str]:
     """Return the names of the columns in lower case; InputError when one is unknown or missing."""
-    names = [name.casefold() for name in header]
     known = (*LOCATION_COLUMNS, *VALUE_COLUMNS)
     where = f"{path}: header"
-    for name in names:
-        if name not in known and _CLOCK.fullmatch(name) is None:
-            meant = find_misspelling([name], known)
-            hint = f"Did you mean {meant[1]}?" if meant else f"Columns: {', '.join(known)}, or starts such as 07:15."
-            raise InputError(where, f"unknown column {name!r}", hint)
+    hint = f"Columns: {', '.join(known)}, or starts such as 07:15."
+    names = parse_header(where, header, known, hint, _CLOCK.fullmatch)
     has_starts = any(_CLOCK.fullmatch(name) for name in names)
     if has_starts == ("count" in names):
         problem = "expected a column count, or columns named by their start, got " + ("both" if has_starts else "none")
@@ -338,7 +334,7 @@ def _parse_row(
     where: str, values: Mapping[str, str], index: ApproachIndex, edges: frozenset[str], kinds: frozenset[str]
 ) -> Iterator[_Row]:
     kind = values.get("kind", "")
-    if kind in ("all", "total"):
+    if kind.casefold() in _ALL_TURNS:
         kind = ""
     if kind and kind not in kinds:
         raise InputError(
@@ -422,9 +418,8 @@ def _parse_clock(where: str, text: str) -> int:
 
 def _parse_count(where: str, text: str) -> float:
     value = number_or_nan(text, parse_decimal)
-    if _THOUSANDS.fullmatch(text):
-        problem = f"{text} can mean {text.replace('.', '')} or {value:g}"
-        raise InputError(where, problem, "Use no separators of thousands.")
+    if choices := ambiguous_number(text):
+        raise InputError(where, f"{text} can mean {choices}", f"Write {choices}.")
     if not 0 <= value <= _MAX_COUNT:
         problem = f"expected a number of vehicles of 0 to {_MAX_COUNT:,.0f}, got {text!r}"
         raise InputError(where, problem, "Use a number such as 120.")

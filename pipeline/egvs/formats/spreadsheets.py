@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from typing import TypeVar
 
 from egvs.core import limits
 from egvs.core.errors import InputError, raise_together
+from egvs.core.numbers import number_or_nan
 from egvs.core.wording import list_first
 from egvs.formats import workbooks
 from egvs.formats.workbooks import MAX_COLUMNS
@@ -44,6 +46,8 @@ _FORMULA_ERROR = re.compile(rf"#[^\W\d][\w/]*[!?]|#N/A|#NV|Err:5[0-9]{{2}}|{work
 _MARKUP = re.compile(r"\s*<(?:[!?]|html|table)", re.IGNORECASE)
 _SAVE_HINT = "Save it as CSV in UTF-8."
 _MAX_NAMED = 5
+_MAX_ABOVE = 10
+"""Rows that may be above the names of the columns by mistake."""
 
 
 @dataclass(frozen=True)
@@ -160,12 +164,12 @@ def _make_table(where: str, unit: str, rows: Iterable[tuple[int, list[str]]]) ->
     if not rows:
         raise InputError(where, "expected a header and rows, got no values", "Write one row per item.")
     first, header = rows.pop(0)
-    titles = [cell for cell in header if cell]
-    if len(titles) == 1 and rows and sum(map(bool, rows[0][1])) > 1:
-        problem = f"expected the names of the columns, got {titles[0][:80]!r} alone"
-        raise InputError(
-            f"{where}: {unit} {first}", problem, "Remove what is above the names, or check the separators."
-        )
+    names_row = _names_below(header, rows[:_MAX_ABOVE])
+    if names_row is not None:
+        title = next(cell for cell in header if cell)
+        problem = f"expected the names of the columns, got {title[:80]!r}"
+        hint = f"Remove what is above the names ({unit} {names_row}?), or check the separators."
+        raise InputError(f"{where}: {unit} {first}", problem, hint)
     if len(header) > MAX_COLUMNS:
         problem = f"expected at most {MAX_COLUMNS} columns, got {len(header):,}"
         raise InputError(where, problem, "Remove columns that are not needed.")
@@ -185,6 +189,20 @@ def _make_table(where: str, unit: str, rows: Iterable[tuple[int, list[str]]]) ->
             hint = "Check the separators, and the quotes around values with one."
             table.errors.append(InputError(table.locate(number), problem, hint))
     return table
+
+
+def _names_below(header: list[str], rows: list[tuple[int, list[str]]]) -> int | None:
+    """Return the number of the row that probably has the names of the columns, if ``header`` is a title above it.
+
+    It has more values than the header, which has a single one, or else no number among them.
+    """
+    titles = sum(map(bool, header))
+    for number, cells in rows:
+        texts = [cell for cell in cells if cell]
+        is_all_text = all(math.isnan(number_or_nan(cell.replace(",", "."))) for cell in texts)
+        if len(texts) > titles and (titles == 1 or is_all_text):
+            return number
+    return None
 
 
 def _use_decimal_points(table: _Table) -> None:
@@ -226,8 +244,12 @@ def _read_text(path: Path, data: bytes) -> _Table:
     if named is not None:
         text, skipped, separator = rest, 1, named[1]
     else:
-        header = next((line for line in text.splitlines() if line.strip(" ,;\t")), "")
+        lines = [line for line in text.splitlines() if line.strip(" ,;\t")]
+        header = lines[0] if lines else ""
         separator = max(_SEPARATORS, key=header.count)
+        names = next((line for line in lines[1:_MAX_ABOVE] if any(map(line.count, _SEPARATORS))), "")
+        if separator not in names:  # the first line is a title, in which there may be a comma
+            separator = max(_SEPARATORS, key=names.count)
         if "|" in header and not header.count(separator):
             raise InputError(path, "the columns are separated by '|'", "Use commas or semicolons.")
     table = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True, strict=True)

@@ -522,7 +522,7 @@ def _unreachable_share_error(scenario: Scenario, problem: Problem, placement_pro
         reached = nearest.point.plan_value.joint / placement_problem.joint_of_all
     names = ", ".join(_site_names(placement_problem, nearest.order))
     return InputError(
-        f"{scenario.file}: placement.reach",
+        scenario.locate("placement.reach"),
         f"no plan within the count, the budget and the other rules reaches {scenario.placement.reach:g}",
         f"Lower it to at most {np.floor(reached * 1000) / 1000:g}, which {names} reach.",
     )
@@ -547,7 +547,7 @@ def _unmet_zone_error(
         names = ", ".join(_site_names(placement_problem, larger.order))
         hint = f"Set placement.count to {len(larger.order)}: {names} see enough."
     return InputError(
-        f"{scenario.file}: placement.zones",
+        scenario.locate("placement.zones"),
         f"found no plan of {number_of(problem.rules.count, 'sensor')} that meets the requirements of all zones;"
         f" the closest ({nearest}) sees {' and '.join(shares)}",
         hint,

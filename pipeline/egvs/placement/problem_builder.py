@@ -271,7 +271,7 @@ def build_problem(context: StageContext, on_progress: Callable[[int], None]) -> 
     if zone_view is not None:
         areas = placement_zones(scenario)
         for name, zone in scenario.placement.zones.items():
-            where = f"{scenario.file}: placement.zones.{name}"
+            where = scenario.locate(f"placement.zones.{name}")
             inside = _voxels_in_area(areas[name], tpogs[""].grid, zone_view.voxels)
             term = problem.zone_term(name, visibilities[0], tpogs[""], zone_view.voxels, inside, zone.by)
             demands.append(_zone_demand(term, zone, where))
@@ -390,7 +390,7 @@ def _check_zone_reachable(scenario: Scenario, demand: Demand, reachable: float) 
     zone = scenario.placement.zones[demand.term.name]
     sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
     raise InputError(
-        f"{scenario.file}: placement.zones.{demand.term.name}.share",
+        scenario.locate(f"placement.zones.{demand.term.name}.share"),
         f"expected a share that the candidates can reach, got {zone.share:g}: with all of them,"
         f" {reachable:.3g} of the zone's entropy is seen{sensors}",
         f"Set it to at most {np.floor(reachable * 1000) / 1000:g}, or add candidates.",
@@ -415,11 +415,11 @@ def _check_periods(scenario: Scenario) -> None:
     names = [period.name for period in scenario.traffic.periods]
     if placement.objective == "worst" and not names:
         raise InputError(
-            f"{scenario.file}: placement.objective",
+            scenario.locate("placement.objective"),
             'expected "mean", since the traffic has no periods, got "worst"',
             'Set it to "mean", or add [[traffic.periods]].',
         )
-    where = f"{scenario.file}: placement.periods"
+    where = scenario.locate("placement.periods")
     for name in placement.periods:
         if name not in names:
             hint = "Remove the key, or add [[traffic.periods]]."
@@ -441,7 +441,7 @@ def _check_zone_in_roi(scenario: Scenario, name: str, area: BaseGeometry) -> Non
         return
     key = "polygon_m" if scenario.placement.zones[name].file is None else "file"
     raise InputError(
-        f"{scenario.file}: placement.zones.{name}.{key}",
+        scenario.locate(f"placement.zones.{name}.{key}"),
         f"zone {name} is outside the region of interest",
         f"Use corners within x {west_m:g} to {east_m:g} m and y {south_m:g} to {north_m:g} m.",
     )
@@ -511,7 +511,7 @@ def _candidate_index(name: str, names: list[str], where: str) -> int:
 
 def _check_count(scenario: Scenario, n_allowed: int, n_sites: int, n_forced: int) -> None:
     """Raise InputError for a count above the candidates or below the forced sensors."""
-    where = f"{scenario.file}: placement.count"
+    where = scenario.locate("placement.count")
     count = scenario.placement.count
     if count is None:
         return
@@ -553,7 +553,7 @@ def candidate_costs(scenario: Scenario, sites: Sequence[Site]) -> tuple[FloatArr
     """
     costs = scenario.costs
     known = dict.fromkeys([*(site.sensor for site in sites), *scenario.sensors])
-    check_sensor_names(costs.sensor, known, f"{scenario.file}: costs.sensor")
+    check_sensor_names(costs.sensor, known, scenario.locate("costs.sensor"))
     has_budget = scenario.placement.budget is not None
     sites_file = scenario.sites.file or scenario.file
     cost = np.zeros(len(sites))
@@ -572,10 +572,10 @@ def candidate_costs(scenario: Scenario, sites: Sequence[Site]) -> tuple[FloatArr
         if has_budget and not costs.are_given:
             column = f', or a column "{COST_COLUMN}" to {scenario.sites.file}' if scenario.sites.file else ""
             hint = f"Add a [costs] table{column}."
-            raise InputError(f"{scenario.file}: placement.budget", f"the cost of site {site.name} is unknown", hint)
+            raise InputError(scenario.locate("placement.budget"), f"the cost of site {site.name} is unknown", hint)
         if costs.sensor and site.sensor not in costs.sensor:
             problem_text = f"the cost of sensor {site.sensor} (site {site.name}) is unknown"
-            raise InputError(f"{scenario.file}: costs.sensor", problem_text, f'Add "{site.sensor}" = COST.')
+            raise InputError(scenario.locate("costs.sensor"), problem_text, f'Add "{site.sensor}" = COST.')
         exists = pole_exists(site.pole, scenario.sites.existing_poles)
         cost[i] = costs.of_mount(site.sensor, site.pose.z_m, pole_exists=exists)
         pole_cost[i] = 0.0 if exists else costs.pole

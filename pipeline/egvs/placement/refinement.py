@@ -37,7 +37,7 @@ from egvs.scenario.score_config import RefinementConfig
 from egvs.scoring.visibility import Beams
 from egvs.sensors import site_feasibility
 from egvs.sensors.scanner import Scanner
-from egvs.sensors.sites import Pose, Site, candidate_sites
+from egvs.sensors.sites import Pose, Site, candidate_sites, wrap_deg
 from egvs.stages.base import StageContext
 from egvs.traffic import sumo_folder
 from egvs.world.carriageway import Carriageway
@@ -93,7 +93,8 @@ class Axis:
     Attributes
     ----------
     name
-        A field of :class:`egvs.sensors.sites.Pose`, or the distance along a line. ``z_m`` counts from the ground.
+        A field of :class:`egvs.sensors.sites.Pose`, or the distance along a line. ``z_m`` counts from the ground,
+        ``roll_deg`` from upside down for a sensor that is (:attr:`egvs.sensors.sites.Pose.side_tilt_deg`).
     low, high
         Its range, in m or degrees.
     is_periodic
@@ -166,6 +167,7 @@ class Freedom:
     def point(self, pose: Pose) -> FloatArray:
         """Return the point of the box that is closest to a pose, (axes,) float64."""
         values = asdict(pose)
+        values["roll_deg"] = pose.side_tilt_deg
         values["z_m"] = self._height_m(pose)
         if self.line is not None:
             import shapely
@@ -187,6 +189,8 @@ class Freedom:
 
             if not shapely.intersects_xy(self.area, values["x_m"], values["y_m"]):
                 return None
+        if self.pose.is_inverted and "roll_deg" in values:
+            values["roll_deg"] = wrap_deg(values["roll_deg"] + 180.0)
         values = {**asdict(self.pose), "z_m": self._height_m(self.pose), **values}
         if self.ground_m is not None:
             ground_m = self.ground_m(values["x_m"], values["y_m"])
@@ -276,7 +280,7 @@ def sensor_freedoms(
         freedoms.append(freedom if freedom is not None and freedom.axes else None)
     if not any(freedoms):
         raise InputError(
-            f"{scenario.file}: placement.refine",
+            scenario.locate("placement.refine"),
             "no sensor of the plan can move",
             "Set a range of heights or angles, or use sensors that are neither forced nor measured.",
         )
@@ -291,7 +295,7 @@ def _sensor_freedom(
         "z_m": heights_m,
         "yaw_deg": config.yaw_deg or (-180.0, 180.0),
         "pitch_deg": config.pitch_deg,
-        "roll_deg": config.roll_deg or (pose.roll_deg, pose.roll_deg),
+        "roll_deg": config.roll_deg or (0.0, 0.0),
     }
     mount_axes = []
     for name, (low, high) in ranges.items():

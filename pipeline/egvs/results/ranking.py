@@ -279,9 +279,20 @@ def describe_mount(mount: Mounted, *, has_relief: bool = False, is_moved: bool =
     tilt = "level"
     if pitch_deg := round(mount.pitch_deg, 1):
         tilt = f"tilted {abs(pitch_deg):g}° {'up' if pitch_deg > 0 else 'down'}"
-    if roll_deg := round(mount.roll_deg, 1):
-        tilt += ", upside down" if abs(roll_deg) == 180 else f", rolled by {roll_deg:g}°"
-    return f"{height}, {tilt}"
+    return ", ".join(words for words in (height, tilt, describe_roll(mount.roll_deg)) if words)
+
+
+def describe_roll(roll_deg: float) -> str:
+    """Return the roll of a sensor in words; empty without any.
+
+    >>> describe_roll(10.0), describe_roll(180.0), describe_roll(-178.5), describe_roll(0.0)
+    ('rolled by 10°', 'upside down', 'upside down, rolled by 1.5°', '')
+    """
+    pose = Pose(0.0, 0.0, 0.0, roll_deg=roll_deg)
+    words = ["upside down"] if pose.is_inverted else []
+    if side_deg := round(pose.side_tilt_deg, 1):
+        words.append(f"rolled by {side_deg:g}°")
+    return ", ".join(words)
 
 
 def is_named_after_pole(mount: Mounted) -> bool:

@@ -24,7 +24,8 @@ from pydantic.fields import FieldInfo
 from egvs.core import files, reading
 from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
-from egvs.core.numbers import number_or_nan
+from egvs.core.numbers import WrittenNumber, ambiguous_number, number_or_nan
+from egvs.core.table_columns import parse_header
 from egvs.scenario.fields import NAME_DESCRIPTION
 from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario, StaticsConfig
 from egvs.scenario.settings import changed_settings, flatten_settings
@@ -295,6 +296,7 @@ def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
     if file.resolve() in extending:
         raise InputError(f"{file}: extends", "the scenario extends itself", "Extend a different scenario.")
     values = _with_count_tables(reading.read_toml(file), file)
+    _check_amounts("", values, str(file))
     extends = values.get("extends", "")
     if not isinstance(extends, str):
         raise InputError(f"{file}: extends", f"expected the path of a scenario folder, got {extends!r}")
@@ -302,6 +304,16 @@ def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
         return values
     base = _read_with_bases(file.parent / extends / SCENARIO_FILE, (*extending, file.resolve()))
     return _merge(_drop_replaced_keys(base, values), values)
+
+
+def _check_amounts(key: str, value: Any, where: str) -> None:
+    """Raise an InputError for a budget or a cost in which a point can separate thousands: 30.000."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            _check_amounts(f"{key}.{name}" if key else name, inner, where)
+    elif isinstance(value, WrittenNumber) and key.startswith(("placement.budget", "costs.")):
+        choices = ambiguous_number(value.text)
+        raise InputError(f"{where}: {key}", f"{value.text} can mean {choices}", f"Write {choices}.")
 
 
 def _with_count_tables(values: dict[str, Any], file: Path) -> dict[str, Any]:
@@ -325,10 +337,10 @@ def _read_counts(path: Path, where: str) -> list[dict[str, Any]]:
     first = text.partition("\n")[0]
     has_semicolons = first.count(";") > first.count(",")
     rows = csv.DictReader(text.splitlines(), delimiter=";" if has_semicolons else ",")
-    unknown = [name for name in rows.fieldnames or () if name not in (*COUNT_IDS, *COUNT_NAMES, "count", "kind")]
-    if unknown or "count" not in (rows.fieldnames or ()):
-        problem = f"unknown column {unknown[0]!r}" if unknown else "the column 'count' is missing"
-        raise InputError(path, problem, f"Columns: {', '.join((*COUNT_NAMES, *COUNT_IDS))}, count, kind.")
+    known = (*COUNT_NAMES, *COUNT_IDS, "count", "kind")
+    rows.fieldnames = parse_header(path, rows.fieldnames or (), known)
+    if "count" not in rows.fieldnames:
+        raise InputError(path, "the column 'count' is missing", f"Columns: {', '.join(known)}.")
     counts = []
     for number, row in enumerate(rows, start=2):
         count: dict[str, Any] = {key: row[key] for key in (*COUNT_IDS, "kind") if row.get(key)}
@@ -338,6 +350,8 @@ def _read_counts(path: Path, where: str) -> list[dict[str, Any]]:
             hint = "Keep the ids of the template; egvs new --counts FILE reads tables with names only."
             raise InputError(f"{path}: line {number}", "expected from_edge and to_edge, or edge, got neither", hint)
         number_text = row["count"] or ""
+        if choices := ambiguous_number(number_text):
+            raise InputError(f"{path}: line {number}: count", f"{number_text} can mean {choices}", f"Write {choices}.")
         count["per_hour"] = number_or_nan(number_text.replace(",", ".") if has_semicolons else number_text)
         if not 0 <= count["per_hour"] <= MAX_PER_HOUR:
             problem = f"expected vehicles per hour, got {row['count']!r}"
@@ -504,6 +518,7 @@ def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
         value = reading.parse_toml_value(text)
     except (ValueError, RecursionError):
         value = text
+    _check_amounts(key.strip(), value, "--set")
     parts = key.strip().split(".")
     if len(parts) > 1:
         values = _drop_replaced_keys(values, {parts[0]: {parts[1]: value}})

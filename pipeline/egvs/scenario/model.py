@@ -460,6 +460,12 @@ class Scenario(StrictModel):
         """The keys that the period of a scenario from :meth:`by_period` sets itself, else none."""
         return self._period_keys
 
+    def with_site_sensor(self, name: str) -> Scenario:
+        """Return the scenario with a sensor at all sites, as ``sites.replace_sensor`` sets it."""
+        changed = self.model_copy(update={"sites": self.sites.model_copy(update={"replace_sensor": name})})
+        changed._written_site_keys = self._written_site_keys - {"sensor"}
+        return changed
+
     @property
     def written_site_keys(self) -> frozenset[str]:
         """The keys of ``[sites]`` that the user wrote; none for a scenario from ``run.json``, which has all keys."""
@@ -479,6 +485,11 @@ class Scenario(StrictModel):
     def file(self) -> Path:
         """The scenario file, for messages."""
         return self.folder / self._file_name
+
+    def locate(self, key: str) -> str:
+        """Return where a key is, for errors: the command line for one that it sets, else the file."""
+        is_set = any(f"{key}.".startswith(f"{name}.") or name.startswith(f"{key}.") for name in self._overrides)
+        return f"command line: {key}" if is_set else f"{self.file}: {key}"
 
     def with_effects(self, effects: EffectsConfig) -> Scenario:
         """Return the same scenario with other effects; gamma keeps its number, even if it was "auto"."""
@@ -504,7 +515,7 @@ class Scenario(StrictModel):
         InputError
             When there is no such file, or it cannot be read.
         """
-        where = f"{self.file}: {key} = {name!r}"
+        where = f"{self.locate(key)} = {name!r}"
         if len(name) > _MAX_NAME_LENGTH:
             raise InputError(where, f"the path is longer than {_MAX_NAME_LENGTH} characters")
         folders = (sumo_home(),) if name.startswith(_SUMO_HOME_PREFIX) else self._folders

@@ -363,8 +363,10 @@ class RefinementConfig(StrictModel):
     )
     yaw_deg: tuple[Turn, Turn] | None = Field(None, description="Lowest and highest yaw. By default any")
     pitch_deg: tuple[Tilt, Tilt] = Field((-30.0, 10.0), description="Lowest and highest pitch, positive for nose up")
-    roll_deg: tuple[Turn, Turn] | None = Field(
-        None, description="Lowest and highest roll. By default that of the candidate"
+    roll_deg: tuple[Tilt, Tilt] | None = Field(
+        None,
+        description="Lowest and highest roll; from upside down, if the sensor is inverted, as in [sites]. By default "
+        "that of the candidate",
     )
     evaluations: int = Field(300, ge=20, description="Number of poses that are tried for a sensor in each round")
 

@@ -30,14 +30,16 @@ Limits. One junction, two units of one type of sensor, 211 s of labelled sweeps 
 vehicles, seen again and again. The error does not contain how far another place, sensor or person differs, so what is
 printed has an error of at least 10 points (:data:`egvs.results.levels.TRANSFER_ERROR`). Shares are not corrected for
 boxes that match by chance: with a share c of such matches, they are too high by :math:`c (1 - s) / (1 - c)`. It was
-measured of cars only, c = 0.13 (lists shifted by 60 s): 0.10 at s = 0.32 and 0.02 at s = 0.87. If c was 0.32 for larger
-vehicles and 0.36 for people, their shares with less than half a point, they are too high by 0.06 at s = 0.87 and by
-0.11 at s = 0.8; those of larger vehicles below 5 points (0.32, 0.30, 0.32) may all be chance. The reference is what the
-other sensor's list has, 14 m away: vehicles that neither has are not counted, which makes shares too high. People
-follow a road user through time, so their share can be higher than what one sweep shows. Whether a box fits is another
-question (:mod:`egvs.scoring.target_scores`). *Outside the data* are road users of kinds that were not labelled as such,
-and those farther than :data:`FARTHEST_M` from the sensor: the former take the curve of the group they resemble most,
-and :func:`noticed_bounds` says how far the mean depends on both.
+measured of cars only, c = 0.13 (lists shifted by 60 s): 0.10 at s = 0.32 and 0.02 at s = 0.87. In simulated traffic in
+which 0.13 of the cars match, too, 0.13 and 0.15 of the larger vehicles do, which match any vehicle, and 0.03 of the
+people, one a frame as in the labels (``benchmarks.chance_matches``): too high by 0.12 at s = 0.32 and 0.03 at s = 0.82
+(larger vehicles), and by 0.02 at s = 0.5 (people). If all that matches with less than half a point were chance (0.32
+and 0.36), it would be 0.06 at s = 0.87 and 0.11 at s = 0.8. The reference is what the other sensor's list has, 14 m
+away: vehicles that neither has are not counted, which makes shares too high. People follow a road user through time, so
+their share can be higher than what one sweep shows. Whether a box fits is another question
+(:mod:`egvs.scoring.target_scores`). *Outside the data* are road users of kinds that were not labelled as such, and
+those farther than :data:`FARTHEST_M` from the sensor: the former take the curve of the group they resemble most, and
+:func:`noticed_bounds` says how far the mean depends on both.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from egvs.effects.returns import ReturnProbability
 from egvs.scoring.blindspots import CELL_M, blindspot_map_shape
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
-from egvs.traffic.network import Lane, Network, is_carriageway
+from egvs.traffic.network import LANE_WIDTH_M, Lane, Network, is_carriageway
 
 OVERLAP_POINTS = SEEN_WELL_POINTS
 """A sensor counts in a map of overlap where it has at least this number of points."""
@@ -120,7 +120,7 @@ class TargetPositions:
         cells = [np.empty((0, 2), dtype=np.int64)]
         poses = [np.empty((0, 4))]
         middles_m = _cell_middles_m(grid)
-        for area, height_and_yaw in _surfaces(target, network):
+        for area, height_and_yaw in _surfaces(target, network, grid):
             covered = _covered_cells(area, middles_m, grid)
             at_m = middles_m[covered[:, 0], covered[:, 1]]
             cells.append(covered)
@@ -195,13 +195,20 @@ _PoseAt = Callable[[FloatArray], FloatArray]
 """Height and yaw, (k, 2), of points (k, 2) on a surface."""
 
 
-def _surfaces(target: StandardTarget, network: Network) -> Iterator[tuple[Any, _PoseAt]]:
-    """Yield the areas on which a target stands, with their heights and headings."""
+def _surfaces(target: StandardTarget, network: Network, grid: Grid) -> Iterator[tuple[Any, _PoseAt]]:
+    """Yield the areas near a grid on which a target stands, with their heights and headings."""
     import shapely
 
+    low_m = np.asarray(grid.origin_m[:2])
+    high_m = low_m + np.asarray(grid.roi.size_m[:2])
     for edge in network.all_edges:
         for lane in edge.lanes:
             line_m = lane.shape_m
+            margin_m = CELL_M + (lane.width_m or LANE_WIDTH_M)
+            if (line_m[:, :2].max(axis=0) < low_m - margin_m).any() or (
+                line_m[:, :2].min(axis=0) > high_m + margin_m
+            ).any():
+                continue
             if edge.function == "walkingarea":
                 if target is PEDESTRIAN and len(line_m) > 2:
                     yield shapely.make_valid(shapely.Polygon(line_m[:, :2])), _at_height(float(line_m[:, 2].mean()))

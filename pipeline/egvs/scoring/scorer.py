@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts.tpog import Tpog
+from egvs.core.errors import InputError, check_instance
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.wording import format_percent
 from egvs.scoring.egvs import EntropyField
@@ -91,6 +92,11 @@ class Scorer:
         Groups of blocks that are left out in turn, for standard errors.
     periods
         TPOGs of single periods; each scan is scored against these as well, with the same hits.
+
+    Raises
+    ------
+    InputError
+        If the scene is a path, or the TPOG has another grid than the scene's region of interest.
     """
 
     def __init__(
@@ -101,6 +107,9 @@ class Scorer:
         leave_out: BlockJackknife | None = None,
         periods: tuple[PeriodTpog, ...] = (),
     ) -> None:
+        check_instance("scene", scene, Scene, "egvs.build_scene(scenario)")
+        check_instance("tpog", tpog, Tpog, "egvs.read_tpog(path)")
+        _check_grid(tpog, scene)
         self._arguments = (scene, tpog, trajectories, leave_out, periods)
         additional = scene.scenario.score.additional
         self._requested_shares: tuple[str, ...] = tuple(name for name in VOXEL_SHARES if name in additional)
@@ -154,6 +163,13 @@ class Scorer:
             replicates = tpog.leave_out.scores(hits, self._gamma, unit)
         shares = {name: tpog.share(name, hits, score.entropy_seen) for name in self._requested_shares}
         return SiteScore(score.egvs, score.entropy_seen, replicates, shares)
+
+
+def _check_grid(tpog: Tpog, scene: Scene) -> None:
+    expected = scene.scenario.roi.grid
+    if tpog.grid != expected:
+        problem = f"its {tpog.grid} is not that of the scene, {expected}"
+        raise InputError("tpog", problem, "Use the tpog.parquet of a run of this scenario, with the same settings.")
 
 
 def _as_beams(scan: Scan | Beams) -> Beams:

@@ -70,6 +70,11 @@ class GroundPlane:
     x_m: tuple[float, float]
     y_m: tuple[float, float]
 
+    @property
+    def is_inverted(self) -> bool:
+        """Whether the sensor is upside down."""
+        return bool(self.normal[2] < 0.0)
+
     def upside_down(self) -> GroundPlane:
         """The same plane in the frame of a sensor that is turned by 180 degrees about its x axis."""
         low_m, high_m = self.y_m

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, check_instance
 from egvs.core.grid import FloatArray, Roi, Vec3
 from egvs.core.wording import number_of
 from egvs.formats import point_clouds
@@ -106,6 +106,7 @@ class Scanner:
     """
 
     def __init__(self, scene: Scene, *, full_sweep: bool = False, mounts: int = _CACHED_MOUNTS) -> None:
+        check_instance("scene", scene, Scene, "egvs.build_scene(scenario)")
         self.scene = scene
         self.full_sweep = full_sweep
         self._mounts = mounts
@@ -144,8 +145,10 @@ class Scanner:
         Raises
         ------
         InputError
-            Where no sensor can stand, naming the coordinates.
+            Where no sensor can stand, naming the coordinates; if the sensor is a name.
         """
+        check_instance("pose", pose, Pose, "egvs.Pose(x_m=..., y_m=..., z_m=...)")
+        check_instance("sensor", sensor, Sensor, f"scene.sensor({sensor!r})")
         return self._cast(pose, sensor, f"pose ({pose.x_m:g}, {pose.y_m:g}, {pose.z_m:g})")
 
     def scan_site(self, site: Site) -> Scan:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egvs.core.errors import InputError
-from egvs.core.grid import PLANE_TOLERANCE_M, IntArray
+from egvs.core.grid import PLANE_TOLERANCE_M, IntArray, Roi
 from egvs.kernels import occupancy, ray_triangle
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor
@@ -44,21 +44,31 @@ def check_pose(scene: Scene, pose: Pose, sensor: Sensor, where: str) -> None:
     if not pose.z_m > ground_m + ray_triangle.EDGE_M:
         problem = f"z_m = {pose.z_m:g} is not above the ground (z = {ground_m:.4g})"
         raise InputError(where, problem, f"Use a height above {ground_m:.4g} m.")
-    below = np.subtract(roi.origin_m, pose.position_m)
-    above = np.subtract(pose.position_m, np.add(roi.origin_m, roi.size_m))
-    distance_m = float(np.sqrt((np.maximum(np.maximum(below, above), 0.0) ** 2).sum()))
-    if distance_m > sensor.range_m + PLANE_TOLERANCE_M:
+    distance_m = _distance_m(roi, pose.position_m)
+    reach_m = sensor.range_m + PLANE_TOLERANCE_M
+    if distance_m > reach_m:
         problem = f"the site is {distance_m:.1f} m from the region of interest"
         hint = f"Move it within the range of {sensor.name}, {sensor.range_m:g} m."
+        middle_x_m, middle_y_m = np.add(roi.origin_m, np.divide(roi.size_m, 2.0))[:2].tolist()
+        if _distance_m(roi, (pose.x_m + middle_x_m, pose.y_m + middle_y_m, pose.z_m)) <= reach_m:
+            middle = f"The middle of the region is at x {middle_x_m:.6g}, y {middle_y_m:.6g}"
+            hint += f" {middle}: add it to positions that count from there."
         may_be_degrees = abs(pose.x_m) <= 180.0 and abs(pose.y_m) <= 90.0
         if may_be_degrees:
-            hint += " Longitude and latitude belong in columns lon_deg and lat_deg."
+            hint += " Longitude and latitude belong in columns longitude and latitude."
         raise InputError(where, problem, hint)
     enclosing = _enclosing_solid(scene.world, pose, faces, scene.own_supports(pose))
     if enclosing is not None:
         name, kind = scene.world.solids[enclosing]
         problem = f"({pose.x_m:g}, {pose.y_m:g}, {pose.z_m:g}) is inside {name} ({kind})"
         raise InputError(where, problem, _outside_hint(scene.world, enclosing))
+
+
+def _distance_m(roi: Roi, position_m: tuple[float, float, float]) -> float:
+    """Return the distance of a point (x, y, z) from a region."""
+    below = np.subtract(roi.origin_m, position_m)
+    above = np.subtract(position_m, np.add(roi.origin_m, roi.size_m))
+    return float(np.sqrt((np.maximum(np.maximum(below, above), 0.0) ** 2).sum()))
 
 
 def _outside_hint(world: World, solid: int) -> str:

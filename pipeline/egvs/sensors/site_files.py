@@ -28,12 +28,13 @@ import numpy as np
 from egvs.core import limits
 from egvs.core.errors import InputError, find_misspelling
 from egvs.core.grid import FloatArray
-from egvs.core.numbers import parse_decimal
+from egvs.core.numbers import ambiguous_number, parse_decimal
 from egvs.core.reading import read_json
 from egvs.formats import spreadsheets, vector_files
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference, declared_crs, geojson_coordinates
 from egvs.formats.workbooks import MAX_COLUMNS
 from egvs.scenario.fields import same_name
+from egvs.scenario.score_config import COST_COLUMN
 
 REQUIRED_COLUMNS = ("site", "x_m", "y_m", "z_m")
 AIM_COLUMNS = ("aim_x_m", "aim_y_m", "aim_z_m")
@@ -108,10 +109,20 @@ def read_table(path: Path, world: Georeference) -> tuple[list[SiteRow], list[Inp
     for where, values in table.rows:
         located.append(SiteRow(f"{where} ({values['site']})" if values.get("site") else where, values))
         check_site_count(len(located), path, "each row is one", "Use fewer rows.")
+    _check_costs(located)
     located, errors = _rows_in_world_frame(located, path, world)
     columns = _parse_numeric_columns([row.columns for row in located], KNOWN_COLUMNS)
     rows = [SiteRow(row.where, values) for row, values in zip(located, columns, strict=True)]
     return rows, [*table.errors, *errors]
+
+
+def _check_costs(rows: list[SiteRow]) -> None:
+    """Raise an InputError where each cost with a point can also be a number of thousands: 8.000."""
+    costs = [(row.where, text) for row in rows if "." in (text := row.columns.get(COST_COLUMN, ""))]
+    if costs and all(ambiguous_number(text) for _, text in costs):
+        where, text = costs[0]
+        choices = ambiguous_number(text)
+        raise InputError(f"{where}: {COST_COLUMN}", f"{text} can mean {choices}", f"Write {choices}.")
 
 
 _FEWER_CANDIDATES = "Use a wider spacing, or fewer heights and pitches."

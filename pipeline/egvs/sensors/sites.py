@@ -211,7 +211,7 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
     poles = list(dict.fromkeys(site.pole for site in sites.values()))
     for pole in scenario.sites.existing_poles if scenario.sites.existing_poles != "all" else ():
         if pole not in poles:
-            raise unknown_site(f"{scenario.file}: sites.existing_poles", pole, poles)
+            raise unknown_site(scenario.locate("sites.existing_poles"), pole, poles)
     _check_keep_visibility(scenario, sites)
     return _with_measured_scan(tuple(sites.values()), scenario)
 
@@ -273,7 +273,7 @@ def _check_unused_keys(scenario: Scenario, used_keys: set[str], path: Path) -> N
             hint = "Remove one of them."
         elif key == "sensor":
             hint = f"Use sites.replace_sensor={config.sensor} to replace them, or remove the key."
-        raise InputError(f"{scenario.file}: sites.{key}", problem, hint)
+        raise InputError(scenario.locate(f"sites.{key}"), problem, hint)
 
 
 def _check_keep_visibility(scenario: Scenario, sites: Mapping[str, Site]) -> None:
@@ -282,7 +282,7 @@ def _check_keep_visibility(scenario: Scenario, sites: Mapping[str, Site]) -> Non
         return
     for name in kept:
         if name not in sites:
-            raise unknown_site(f"{scenario.file}: score.keep_visibility", name, list(sites))
+            raise unknown_site(scenario.locate("score.keep_visibility"), name, list(sites))
 
 
 def _with_measured_scan(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Site, ...]:
@@ -291,7 +291,7 @@ def _with_measured_scan(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Si
         return sites
     if len(sites) != 1:
         hint = "Add a column 'points' to the sites file, or use a single site."
-        raise InputError(f"{scenario.file}: sites.points", f"one measured scan is given for {len(sites)} sites", hint)
+        raise InputError(scenario.locate("sites.points"), f"one measured scan is given for {len(sites)} sites", hint)
     return (replace(sites[0], points=points),)
 
 

@@ -75,7 +75,7 @@ def _check_kept_sites(scenario: Scenario, selection: SiteSelection) -> None:
     for name in requested:
         if name in reasons:
             problem = f"the site {name!r} is dropped: it stands {reasons[name]}"
-            raise InputError(f"{scenario.file}: score.keep_visibility", problem, "Use a site that is scored.")
+            raise InputError(scenario.locate("score.keep_visibility"), problem, "Use a site that is scored.")
 
 
 def with_effects(plain: Scene) -> Scene:

@@ -306,7 +306,7 @@ def _leftover_frames(scenario: Scenario, frames: int) -> int:
     unused = frames % blocks
     if unused == frames or (unused and scenario.traffic.frames is not None):
         problem = f"{blocks} does not divide the {frames} recorded frames"
-        raise InputError(f"{scenario.file}: tpog.blocks", problem, f"Use a divisor of {frames}.")
+        raise InputError(scenario.locate("tpog.blocks"), problem, f"Use a divisor of {frames}.")
     return unused
 
 

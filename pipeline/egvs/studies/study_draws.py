@@ -69,7 +69,7 @@ class TrafficUnits:
             return cls(blocks, (Window(0, blocks),))
         if blocks < MIN_UNITS:
             problem = f"the traffic is a finished file, so a study needs at least {MIN_UNITS} blocks, got {blocks}"
-            raise InputError(f"{scenario.file}: tpog.blocks", problem, "Use 10, or another number of blocks.")
+            raise InputError(scenario.locate("tpog.blocks"), problem, "Use 10, or another number of blocks.")
         parts = min(RECORDED_PARTS, blocks)
         per_part = blocks // parts
         return cls(blocks, tuple(Window(part * per_part, per_part) for part in range(parts)))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from egvs.core.errors import InputError
@@ -22,21 +22,22 @@ from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import Edge
 
 TURN_WORDS = {
-    "left": "left", "l": "left",
+    "left": "left", "l": "left", "links": "left", "linksabbieger": "left",
     "straight": "straight", "straight on": "straight", "through": "straight", "thru": "straight", "t": "straight",
-    "s": "straight",
-    "right": "right", "r": "right",
-    "u-turn": U_TURN, "uturn": U_TURN, "u turn": U_TURN, "u": U_TURN, "back": U_TURN,
+    "s": "straight", "geradeaus": "straight", "g": "straight",
+    "right": "right", "r": "right", "rechts": "right", "rechtsabbieger": "right",
+    "u-turn": U_TURN, "uturn": U_TURN, "u turn": U_TURN, "u": U_TURN, "back": U_TURN, "wenden": U_TURN,
 }  # fmt: skip
 """What planners write for the turns of :data:`egvs.traffic.directions.TURNS`."""
 
-_LETTERS = dict(zip(COMPASS, ("e", "ne", "n", "nw", "w", "sw", "s", "se"), strict=True))
-_SIDE_WORDS = {
-    **{side: side for side in COMPASS},
-    **{side.replace("-", ""): side for side in COMPASS},
-    **{letters: side for side, letters in _LETTERS.items()},
-}
-_BOUND = {f"{letters}b": side for side, letters in _LETTERS.items()}
+_SIDES = {
+    "east": "e o ost osten", "north-east": "ne no nordost", "north": "n nord norden", "north-west": "nw nordwest",
+    "west": "w westen", "south-west": "sw suedwest", "south": "s sued sueden", "south-east": "se so suedost",
+}  # fmt: skip
+"""What people write for each of :data:`~egvs.traffic.directions.COMPASS` beside its name, in English and German."""
+
+_SIDE_WORDS = {word: side for side in COMPASS for word in (side, side.replace("-", ""), *_SIDES[side].split())}
+_BOUND = {f"{words.split()[0]}b": side for side, words in _SIDES.items()}
 """Abbreviations of headings: "nb" for northbound."""
 
 _ABBREVIATIONS = {
@@ -45,6 +46,7 @@ _ABBREVIATIONS = {
     "sq": "square", "ct": "court", "pkwy": "parkway",
 }  # fmt: skip
 
+_UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue"})
 _LANE_GROUP = re.compile(r"(NB|NEB|EB|SEB|SB|SWB|WB|NWB)([LTRU]{1,4})")
 
 
@@ -53,10 +55,10 @@ def normalise_street(name: str) -> str:
 
     >>> normalise_street("Main St.") == normalise_street("MAIN STREET")
     True
-    >>> normalise_street("Breite Straße") == normalise_street("Breitestr.")
+    >>> normalise_street("Süd-Straße") == normalise_street("Suedstr.")
     True
     """
-    text = unicodedata.normalize("NFKC", name).casefold()
+    text = unicodedata.normalize("NFKC", name).casefold().translate(_UMLAUTS)
     words = re.sub(r"[^\w]+", " ", text).split()
     words = [re.sub(r"(?<=\w)(strasse|str)$", " street", word) for word in words]
     words = [_ABBREVIATIONS.get(word, word) for word in " ".join(words).split()]
@@ -66,10 +68,11 @@ def normalise_street(name: str) -> str:
 def parse_side(text: str) -> str | None:
     """Return the side on which vehicles arrive, a value of ``COMPASS``; None if the text is no direction.
 
-    >>> parse_side("N"), parse_side("from north"), parse_side("northbound"), parse_side("NB")
-    ('north', 'north', 'south', 'south')
+    >>> parse_side("N"), parse_side("from north"), parse_side("northbound"), parse_side("NB"), parse_side("Ost")
+    ('north', 'north', 'south', 'south', 'east')
     """
-    word = " ".join(text.split()).casefold().removeprefix("from ").removeprefix("the ")
+    words = " ".join(unicodedata.normalize("NFKC", text).casefold().translate(_UMLAUTS).split())
+    word = re.sub(r"^(from (the )?|von |aus )", "", words)
     if word in _SIDE_WORDS:
         return _SIDE_WORDS[word]
     heading = _BOUND.get(word) or _SIDE_WORDS.get(word.removesuffix("bound").rstrip("- "))
@@ -101,13 +104,30 @@ def approach_spellings(side: str, street: str) -> frozenset[str]:
     >>> approach_spellings("north", "Mill Lane").issuperset(former)
     True
     """
-    names = (
-        approach_name(side, street),
-        f"{side} {street}",
-        f"{_LETTERS[side]} {street}",
-        f"{street} {_LETTERS[side]}",
+    name = normalise_street(street)
+    words = [word.replace("-", "") for word, meant in _SIDE_WORDS.items() if meant == side]
+    return frozenset(spelling for word in words for spelling in (name + word, word + name))
+
+
+def names_approach(name: str, side: str, street: str) -> bool:
+    """Return whether a name in the form of :func:`normalise_street` is that of a street, or of the approach there.
+
+    >>> names_approach(normalise_street("Möser Str. (Nord)"), "north", "Möserstraße")
+    True
+    """
+    return bool(street) and (
+        name == normalise_street(street) or (bool(side) and name in approach_spellings(side, street))
     )
-    return frozenset(normalise_street(name) for name in names)
+
+
+def list_approaches(turns: Mapping[str, Iterable[str]]) -> str:
+    """Return the names of approaches, each with its turns.
+
+    >>> list_approaches({"North Street (north)": ["left", "right"], "east": []})
+    'North Street (north) (left, right); east'
+    """
+    texts = {name: ", ".join(filter(None, words)) for name, words in turns.items()}
+    return "; ".join(f"{name} ({text})" if text else name for name, text in texts.items())
 
 
 @dataclass(frozen=True)
@@ -141,14 +161,11 @@ class ApproachMovement:
 
     def is_called(self, name: str) -> bool:
         """Whether a name in the form of :func:`normalise_street` is its street, or its approach."""
-        return self._is_on(self.street, name)
+        return names_approach(name, self.side, self.street)
 
     def has_alias(self, name: str) -> bool:
         """Whether a name is that of another street that leads to the approach."""
-        return any(self._is_on(street, name) for street in self.aliases)
-
-    def _is_on(self, street: str, name: str) -> bool:
-        return name == normalise_street(street) or name in approach_spellings(self.side, street)
+        return any(names_approach(name, self.side, street) for street in self.aliases)
 
 
 @dataclass(frozen=True)
@@ -235,15 +252,15 @@ class ApproachIndex:
         moves = [move for move in candidates if not turns or move.turn in turns]
         missing = sorted(set(turns) - {move.turn for move in moves})
         if missing:
-            known = ", ".join(sorted({move.turn for move in candidates if move.turn})) or "none"
             problem = f"the approach {next(iter(approaches))} has no movement {' or '.join(missing)}"
-            raise InputError(where, problem, f"Its turns are: {known}.")
+            raise InputError(where, problem, self.hint)
         return moves
 
     @property
     def hint(self) -> str:
-        """The names of the junction, as a sentence."""
-        return f"The approaches are: {', '.join(self.titles)}."
+        """The approaches of the junction with their turns, as a sentence."""
+        turns = {title: {m.turn for m in self.movements if m.approach_title == title} for title in self.titles}
+        return f"The approaches are: {list_approaches({title: sorted(words) for title, words in turns.items()})}."
 
     @property
     def titles(self) -> list[str]:
@@ -254,11 +271,11 @@ class ApproachIndex:
 
 def _on_side(movements: Sequence[ApproachMovement], side: str | None) -> list[ApproachMovement]:
     """Return the movements that arrive on a side, or else on a neighbouring one; all if the side is None."""
-    near = [move for move in movements if side is None or _side_distance(move.side, side) <= 1]
+    near = [move for move in movements if side is None or side_distance(move.side, side) <= 1]
     return [move for move in near if move.side == side] or near
 
 
-def _side_distance(first: str, second: str) -> int:
+def side_distance(first: str, second: str) -> int:
     """Return the number of compass points between two sides, 0 to 4."""
     apart = abs(COMPASS.index(first) - COMPASS.index(second))
     return min(apart, 8 - apart)

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from egvs.core.errors import InputError, find_misspelling, parse_each
+from egvs.core.errors import InputError, parse_each
 from egvs.core.numbers import number_or_nan
+from egvs.core.table_columns import parse_header
 from egvs.formats import spreadsheets
 from egvs.scenario.model import Scenario
 from egvs.traffic.approaches import ApproachIndex
@@ -79,11 +80,7 @@ def read_observations(path: Path, index: ApproachIndex, periods: Sequence[str]) 
 
 def _check_header(path: Path, header: list[str]) -> list[str]:
     """Return the names of the columns; InputError when one is unknown or missing."""
-    for name in header:
-        if name not in COLUMNS:
-            meant = find_misspelling([name], COLUMNS)
-            hint = f"Did you mean {meant[1]}?" if meant else f"Columns: {', '.join(COLUMNS)}."
-            raise InputError(f"{path}: header", f"unknown column {name!r}", hint)
+    header = parse_header(f"{path}: header", header, COLUMNS)
     if not {"street", "approach"} & set(header) or not _LIMITS.keys() & set(header):
         problem = "expected approach or street, and queue_m or speed_kmh"
         raise InputError(f"{path}: header", problem, "Example: approach,queue_m,speed_kmh.")

@@ -28,17 +28,25 @@ from egvs.core import files
 from egvs.core.digests import forget_file
 from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan
+from egvs.core.table_columns import parse_header
 from egvs.core.wording import list_first, number_of, shorten_id
 from egvs.formats import spreadsheets, xml
 from egvs.scenario.model import Scenario
 from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
 from egvs.traffic import network
-from egvs.traffic.approaches import TURN_WORDS, approach_spellings, normalise_street, parse_side
+from egvs.traffic.approaches import (
+    TURN_WORDS,
+    list_approaches,
+    names_approach,
+    normalise_street,
+    parse_side,
+    side_distance,
+)
 from egvs.traffic.directions import Floats
 from egvs.traffic.signals import CROSSING, Link, Phase, Program, Signal, read_signals, replace_programs
 
 _ALL = "all"
-_MOVEMENT_WORDS = {**TURN_WORDS, "crossing": CROSSING}
+_MOVEMENT_WORDS = {**TURN_WORDS, "crossing": CROSSING, "furt": CROSSING, "alle": _ALL}
 
 _OPPOSITE_COSINE = -0.5
 """Approaches whose directions differ by more than 120 degrees are opposite."""
@@ -104,7 +112,7 @@ def _programs(scenario: Scenario, path: Path, roads: network.Network) -> dict[st
     signals = read_signals(path, roads)
     programs: dict[str, Program] = {}
     for name, config in scenario.traffic.signals.items():
-        where = f"{scenario.file}: traffic.signals.{name}"
+        where = scenario.locate(f"traffic.signals.{name}")
         signal = find_signal(name, signals, where)
         if signal.id in programs:
             raise InputError(where, f"the signal {signal.title} has two plans", "Remove one of them.")
@@ -213,9 +221,8 @@ def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str, stated: S
                 turning = {link.edge for link in signal.links if link.movement == requested}
                 selected = [link for link in on_approach if link.target in turning]
             if not selected:
-                known = ", ".join(dict.fromkeys(link.movement for link in on_approach))
                 problem = f"approach {approach!r} has no movement {movement!r}"
-                raise InputError(where, problem, f"Its movements are: {known}.")
+                raise InputError(where, problem, f"Its approaches are: {list_approaches(signal.approaches)}.")
             green |= {link.index for link in selected}
     inside = [link for link in signal.links if link.edge and link.approach not in stated]
     for _ in signal.nodes:
@@ -246,30 +253,24 @@ def _links_of_approach(approach: str, signal: Signal, where: str) -> list[Link]:
         return name in (normalise_street(link.approach), normalise_street(link.edge))
 
     def is_part(link: Link) -> bool:
-        return (side is not None and side == link.side) or name in _spellings(link, link.street)
+        return (side is not None and side == link.side) or names_approach(name, link.side, link.street)
 
     def is_alias(link: Link) -> bool:
-        return any(name in _spellings(link, street) for street in link.aliases)
+        return any(names_approach(name, link.side, street) for street in link.aliases)
+
+    def is_beside(link: Link) -> bool:
+        return side is not None and link.side != "" and side_distance(side, link.side) == 1
 
     matches: list[str] = []
-    for is_meant in (is_full_name, is_part, is_alias):
+    for is_meant in (is_full_name, is_part, is_alias, is_beside):
         matches = matches or list(dict.fromkeys(link.approach for link in signal.links if is_meant(link)))
-    known = "; ".join(f"{name} ({', '.join(movements)})" for name, movements in signal.approaches.items())
     if not matches:
-        raise InputError(
-            where, f"the signal {signal.title} has no approach {approach!r}", f"Its approaches are: {known}."
-        )
+        problem = f"the signal {signal.title} has no approach {approach!r}"
+        raise InputError(where, problem, f"Its approaches are: {list_approaches(signal.approaches)}.")
     if len(matches) > 1:
         problem = f"approach {approach!r} may be {' or '.join(map(repr, matches))}"
         raise InputError(where, problem, "Use the full name.")
     return [link for link in signal.links if link.approach == matches[0]]
-
-
-def _spellings(link: Link, street: str) -> frozenset[str]:
-    """Return what a user may write for the approach of a link on a street."""
-    if not street:
-        return frozenset()
-    return frozenset({normalise_street(street)}) | (approach_spellings(link.side, street) if link.side else frozenset())
 
 
 def _check_conflicts(green: set[int], signal: Signal, where: str) -> None:
@@ -433,11 +434,10 @@ def _read_table(path: Path, config: SignalConfig) -> tuple[SignalPhaseConfig, ..
 
 def _check_header(path: Path, header: list[str]) -> list[str]:
     """Return the names of the columns; InputError when one is unknown or missing."""
-    if missing := [name for name in CSV_COLUMNS if name not in header]:
+    names = parse_header(path, header, (*CSV_COLUMNS, *CSV_OPTIONAL), _CSV_HINT)
+    if missing := [name for name in CSV_COLUMNS if name not in names]:
         raise InputError(path, f"the column {missing[0]!r} is missing", _CSV_HINT)
-    if unknown := [name for name in header if name not in (*CSV_COLUMNS, *CSV_OPTIONAL)]:
-        raise InputError(path, f"unknown column {unknown[0]!r}", _CSV_HINT)
-    return header
+    return names
 
 
 def _parse_seconds(text: str, where: str) -> float:

@@ -259,6 +259,28 @@ def test_scores_of_several_seeds_are_those_of_each_simulation(tmp_path: Path) ->
     assert chosen.se == pytest.approx(math.sqrt(of_traffic + ((cluster - pointpillars) / 2) ** 2))
 
 
+def test_sensor_hangs_as_at_the_sites_of_the_pole(tmp_path: Path, run_egvs: Any) -> None:
+    """Its own mount, although another sensor is at the site; the row that is printed gives the score of the search."""
+    path = one_lane(tmp_path)
+    text = (path / "scenario.toml").read_text()
+    (path / "scenario.toml").write_text(text.replace("[sensors.narrow]", '[sensors.narrow]\nmount = "inverted"'))
+    results = {}
+    for setting in ("sites.roll_deg=0", "sites.roll_deg=10", "sensors.narrow.mount=upright", "sites.mount=upright"):
+        scenario = egvs.load(path, [setting])
+        request = DesignRequest("pole_a", ("narrow",), evaluations=20)
+        results[setting] = design_sensor(scenario, request, tmp_path / "run", jobs=1).chosen
+    rolls_deg = [result.pose.roll_deg for result in results.values()]
+    assert rolls_deg == [180.0, -170.0, 0.0, 0.0]
+    hung, rolled, stood, _ = results.values()
+    assert len({hung.search_score, rolled.search_score, stood.search_score}) == 3
+    options = ["--sensors", "narrow,coarse", "--evaluations", 20, "--set", "sites.roll_deg=10"]
+    code, printed, error = run_egvs("sensor", "design", path, "--pole", "pole_a", *options)
+    assert code == 0, error
+    assert "upside down, rolled by 10°" in printed
+    assert "the sensors are inverted, the roll is kept at 10° (narrow)" in printed.replace("\n", " ")
+    assert ",10.000,upright,coarse" in printed or ",10.000,inverted,narrow" in printed
+
+
 def test_record_without_vehicles_in_one_half_is_rejected(tmp_path: Path) -> None:
     path = one_lane(tmp_path)
     rows = (path / "fcd.csv").read_text().splitlines()

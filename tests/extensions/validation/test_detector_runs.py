@@ -173,3 +173,18 @@ def test_no_worker_outlives_killed_main_process(mini, tmp_path):
         assert killed.wait() == -signal.SIGKILL
         assert select.select([alive], [], [], 60)[0], "a process is still running"
         assert alive.read(1) == b""  # its end was closed with it
+
+
+@pytest.mark.system
+def test_script_without_main_guard_is_refused(mini, tmp_path):
+    """Its worker processes would run the script again, and the main process would wait for them."""
+    (tmp_path / "unguarded.py").write_text(ORPHANS.replace('__name__ == "__main__"', "True"))
+    root = Path(__file__).resolve().parents[3]
+    run = subprocess.run(
+        [sys.executable, tmp_path / "unguarded.py", mini, tmp_path],
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert "RunError" in run.stderr.splitlines()[-1] and 'below `if __name__ == "__main__":`' in run.stderr

@@ -204,7 +204,7 @@ def check_additive_config(scenario: Scenario) -> None:
     for key in ("zones", "survives", "objective", "reach", "refine", "budget", "count"):
         if getattr(config, key) != getattr(default, key):
             raise InputError(
-                f"{scenario.file}: placement.{key}",
+                scenario.locate(f"placement.{key}"),
                 "has no effect in a city, where joint scores are summed and one count or budget is shared",
                 f"Remove the key, or use {shlex.join(['egvs', 'place', str(scenario.folder)])}.",
             )

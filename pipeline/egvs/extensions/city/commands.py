@@ -151,7 +151,7 @@ def place(
     out: CityOut = None,
     count: Annotated[int | None, typer.Option(metavar="K", min=1, help="Find the best K sensors of the city.")] = None,
     budget: Annotated[
-        float | None, typer.Option(metavar="COST", help="Find the best sensors within this total cost (see \\[costs]).")
+        str | None, typer.Option(metavar="COST", help="Find the best sensors within this total cost (see \\[costs]).")
     ] = None,
     phases: Annotated[
         str | None,
@@ -169,9 +169,8 @@ def place(
 
         run_options = _run_options(cluster, junction, set_, screen)
         numbers = _parse_phases(phases)
-        placed = city_run.place_city(
-            model.load_city(city), out, run_options, count=count, budget=budget, phases=numbers
-        )
+        cost = None if budget is None else options.cost(budget)
+        placed = city_run.place_city(model.load_city(city), out, run_options, count=count, budget=cost, phases=numbers)
         for warning in placed.city_run.warnings:
             screen.say(f"warning: {warning}")
     print_plan(placed)

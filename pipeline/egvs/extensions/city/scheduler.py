@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from egvs.core import plugins
 from egvs.core.errors import EgvsError, InputError, RunError
+from egvs.core.main_guard import check_main_guard
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import thread_count
 from egvs.core.wording import by_number
@@ -121,6 +122,7 @@ def connect(cluster: str, *, memory_limit: str = "auto") -> Iterator[Client]:
             with client:
                 yield client
             return
+        check_main_guard()
         with (
             LocalCluster(
                 n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=memory_limit,

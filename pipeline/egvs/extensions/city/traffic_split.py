@@ -474,7 +474,7 @@ def _check_traffic(city: City, junction: CityJunction, scenario: Scenario) -> No
     if abs(stride - round(stride)) > 1e-9 or round(stride) < 1:
         problem = f"expected a multiple of {city_period_s:g} s, the frame period of {city.file}, got {period_s:g} s"
         hint = f"Use, for example, {city_period_s:g}."
-        raise InputError(f"{scenario.file}: traffic.frame_period_s", problem, hint)
+        raise InputError(scenario.locate("traffic.frame_period_s"), problem, hint)
 
 
 def _format_periods(names: Iterable[str]) -> str:

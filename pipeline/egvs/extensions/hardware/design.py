@@ -4,7 +4,7 @@ Steps: for each sensor, search height, yaw and pitch, from the best of the candi
 mounts; take the best; with free channels, search the elevations at that mount. The score is the recommended one, the
 expected share of vehicles found (:data:`egvs.scenario.score_config.DEFAULT_SCORE`), computed from a new empty scan for
 each trial. The search is that of ``egvs place --refine`` (:func:`egvs.placement.refinement.minimise`: random points,
-then CMA-ES).
+then CMA-ES). A sensor hangs as at the sites of the pole, were it the sensor there: mount and roll are not searched.
 
 *Other frames.* A search finds what suits its frames, also by chance. So it sees the first half of each simulation only,
 and all scores and differences that are reported come from the second half, with errors of the block jackknife over its
@@ -68,7 +68,7 @@ from egvs.scoring.zones import weight_zones
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sensor import CATALOGUE, Sensor, check_sensor_names
 from egvs.sensors.site_feasibility import ground_height_m
-from egvs.sensors.sites import Pose, Site
+from egvs.sensors.sites import Pose, Site, candidate_sites
 from egvs.stages.base import StageContext
 from egvs.stages.scene_inputs import with_losses_of_all
 from egvs.statistics.blocks import group_sizes, means_without_each
@@ -244,6 +244,7 @@ def _report_entry(result: DesignResult) -> dict[str, Any]:
                 "height_m": design.pose.z_m - result.ground_m,
                 "yaw_deg": design.pose.yaw_deg,
                 "pitch_deg": design.pose.pitch_deg,
+                "roll_deg": design.pose.roll_deg,
                 "search_score": design.search_score,
                 "score": design.score,
                 "se": design.se,
@@ -342,12 +343,13 @@ class _Designer:
             weight = weight * target_weights(config.weights, weight_zones(self._context.scenario), record)
         if not math.fsum(weight) > 0.0:
             problem = f"no vehicle is in the region of interest in the {which} half of the frames"
-            raise InputError(f"{self._context.scenario.file}: traffic.frames", problem, "Record more frames.")
+            raise InputError(self._context.scenario.locate("traffic.frames"), problem, "Record more frames.")
         return _Half(record, weight)
 
     def best_mount(self, sensor: Sensor, number: int) -> _Trial:
         """Return the best mount of a sensor; the search starts at the best of the candidates and some usual mounts."""
-        poses = [*(site.pose for site in self._sites), *self._usual_poses(sensor)]
+        poses = self._site_poses(sensor)
+        poses += [usual for pose in _one_of_each_roll(poses) for usual in self._usual_poses(sensor, pose)]
         starts = [trial for trial in self._try_all([(sensor, pose) for pose in poses]) if trial is not None]
         if not starts:
             problem = f"no candidate there is possible with {sensor.name}"
@@ -368,15 +370,21 @@ class _Designer:
         minimise(losses, freedom.point(start.pose), freedom.ends, self._evaluations, rng)
         return search.best
 
-    def _usual_poses(self, sensor: Sensor) -> list[Pose]:
+    def _site_poses(self, sensor: Sensor) -> list[Pose]:
+        """Return the poses of a sensor at the sites of the pole: with its own mount, and aimed by its middle ray."""
+        names = {site.name for site in self._sites}
+        sites = candidate_sites(self._context.scenario.with_site_sensor(sensor.name))
+        return [site.pose for site in sites if site.name in names]
+
+    def _usual_poses(self, sensor: Sensor, pose: Pose) -> list[Pose]:
         """Return mounts at three heights and :data:`START_PITCHES_DEG` that face the centre of the region."""
-        pose = self._sites[0].pose
         x_m, y_m, _ = self._context.scenario.roi.center_m
         towards_deg = math.degrees(math.atan2(y_m - pose.y_m, x_m - pose.x_m))
-        yaw_deg = round(math.remainder(towards_deg - sensor.middle_deg[1], 360.0), _ANGLE_DIGITS)
+        middle_deg = -sensor.middle_deg[1] if pose.is_inverted else sensor.middle_deg[1]
+        yaw_deg = round(math.remainder(towards_deg - middle_deg, 360.0), _ANGLE_DIGITS)
         heights_m = np.linspace(*self._heights_m, 3) + self.ground_m
         return [
-            replace(pose, z_m=round(z_m, 3), yaw_deg=yaw_deg, pitch_deg=pitch_deg, roll_deg=0.0)
+            replace(pose, z_m=round(z_m, 3), yaw_deg=yaw_deg, pitch_deg=pitch_deg)
             for z_m in dict.fromkeys(heights_m.tolist())
             for pitch_deg in START_PITCHES_DEG
         ]
@@ -533,6 +541,10 @@ def _sites_at(sites: Sequence[Site], pole: str) -> tuple[Site, ...]:
         known = list(dict.fromkeys(site.pole for site in sites))
         raise InputError("--pole", f"expected a pole with a simulated scan, got {pole!r}", choose_one(pole, known))
     return at_pole
+
+
+def _one_of_each_roll(poses: Sequence[Pose]) -> list[Pose]:
+    return list({pose.roll_deg: pose for pose in poses}.values())
 
 
 def _heights_m(sites: Sequence[Site], ground_m: float) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from egvs.artefacts.run_record import StageRecord
 from egvs.extensions.hardware.files import ACCEPTANCE, FILES, PLANNED_KEY, SENSOR_DESIGN, SHEETS, design_digest
 from egvs.report.extension_sections import SectionWarning
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.ranking import RankedSite
+from egvs.results.ranking import RankedSite, describe_roll
 from egvs.results.sensors import ScoreDifference
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
@@ -177,10 +177,12 @@ def _design_table(pole: str, values: Mapping[str, Any]) -> DesignTable:
             gain += f" ± {100 * difference.se:.1f}"
         if difference.value and not difference.is_clear:
             gain = f"~ {gain}"
+        roll = describe_roll(design.get("roll_deg", 0.0))
         se = math.nan if design["se"] is None else design["se"]
         rows.append(
             DesignRow(
-                design["sensor"], f"{design['height_m']:.2f}", f"{design['yaw_deg']:.1f}",
+                f"{design['sensor']}, {roll}" if roll else design["sensor"],
+                f"{design['height_m']:.2f}", f"{design['yaw_deg']:.1f}",
                 f"{design['pitch_deg']:z.1f}", label.value(design["search_score"]),
                 label.with_error(design["score"], se), gain, design["chosen"],
             )

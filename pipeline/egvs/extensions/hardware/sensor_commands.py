@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from egvs.extensions.hardware.fit.map_pose import MapPose
     from egvs.extensions.hardware.fit.output import FitFolder
     from egvs.scenario.model import Scenario
+    from egvs.sensors.sites import Pose
     from egvs.statistics.intervals import Estimate
 
 _DESIGN_WIDTH = 190
@@ -182,6 +184,7 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
     """Print the fitted values, the ground planes, and the files."""
     from egvs.cli.console import WIDE, Column, console, make_table
     from egvs.extensions.hardware.fit.output import calibration_lines
+    from egvs.sensors.sites import Pose
 
     out = console(WIDE)
     angles = result.angles
@@ -229,7 +232,7 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
     columns: list[Column[int]] = [
         Column("ground plane", lambda i: f"{i + 1}{' (chosen)' if planes[i] is result.plane else ''}", "left"),
         Column("below the sensor", lambda i: f"{planes[i].height_m:.2f} +- {planes[i].height_se_m:.2f} m"),
-        Column("roll", lambda i: f"{planes[i].roll_deg:.2f} deg"),
+        Column("roll", lambda i: f"{Pose(0.0, 0.0, 0.0, roll_deg=planes[i].roll_deg).side_tilt_deg:z.2f} deg"),
         Column("pitch", lambda i: f"{planes[i].pitch_deg:.2f} deg"),
         Column("returns", lambda i: f"{planes[i].returns:,}"),
         Column("roughness", lambda i: f"{planes[i].roughness_m:.2f} m"),
@@ -237,6 +240,8 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
         Column("y", lambda i: f"{planes[i].y_m[0]:.0f} to {planes[i].y_m[1]:.0f} m"),
     ]
     out.print(make_table(columns, range(len(planes))))
+    if result.plane.is_inverted:
+        out.print('The sensor is upside down (mount = "inverted" in sensor.toml); its roll counts from there.')
     out.print(f"Check in {written.folder / 'ground.png'} that the chosen plane is the road; if not, use --ground N.")
     if result.calibrated_pose is not None:
         for line in calibration_lines(result.calibrated_pose):
@@ -421,7 +426,7 @@ def print_design(result: DesignResult, file: Path | None) -> None:
     if result.start is not None and result.designed is not None:
         designs += [result.start, result.designed]
     columns: list[Column[Design]] = [
-        Column("sensor", lambda design: design.sensor.name, align="left"),
+        Column("sensor", _sensor_words, align="left"),
         Column("height m", lambda design: f"{design.pose.z_m - result.ground_m:.2f}"),
         Column("ccw yaw deg", lambda design: f"{design.pose.yaw_deg:.1f}"),
         Column("pitch deg", lambda design: f"{design.pose.pitch_deg:.1f}"),
@@ -438,8 +443,10 @@ def print_design(result: DesignResult, file: Path | None) -> None:
         f"The search saw {searched:,} frames; scores with ± come from {others:,} other frames, so the search"
         " does not bias them.",
         f"Best by the search: {chosen.sensor.name}. Row of sites.csv (site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,"
-        f"sensor): {result.pole},{chosen.pose.x_m:.3f},{chosen.pose.y_m:.3f},{chosen.pose.z_m:.3f},"
-        f"{chosen.pose.yaw_deg:z.3f},{chosen.pose.pitch_deg:z.3f},{chosen.pose.roll_deg:z.3f},{chosen.sensor.name}",
+        f"mount,sensor): {result.pole},{chosen.pose.x_m:.3f},{chosen.pose.y_m:.3f},{chosen.pose.z_m:.3f},"
+        f"{chosen.pose.yaw_deg:z.3f},{chosen.pose.pitch_deg:z.3f},{chosen.pose.side_tilt_deg:z.3f},"
+        f"{mount_key(chosen.pose)},{chosen.sensor.name}",
+        "Mount and roll are not searched: " + "; ".join(_kept_mounts(designs)) + ".",
     ]
     if result.designed is not None:
         elevations = ", ".join(f"{value:g}" for value in result.designed.sensor.elevations_deg)
@@ -448,6 +455,27 @@ def print_design(result: DesignResult, file: Path | None) -> None:
     print_sentences(f"note: {note}" for note in result.notes)
     if file is not None:
         print(f"table for scenario.toml: {file}")
+
+
+def _sensor_words(design: Design) -> str:
+    from egvs.results.ranking import describe_roll
+
+    return ", ".join(filter(None, (design.sensor.name, describe_roll(design.pose.roll_deg))))
+
+
+def mount_key(pose: Pose) -> str:
+    """Return how a sites file states whether a sensor is upside down."""
+    return (Mount.INVERTED if pose.is_inverted else Mount.UPRIGHT).value
+
+
+def _kept_mounts(designs: Sequence[Design]) -> Iterator[str]:
+    """Yield how the sensors hang, and with which roll."""
+    names: dict[tuple[str, float], list[str]] = {}
+    for design in designs:
+        names.setdefault((mount_key(design.pose), design.pose.side_tilt_deg), []).append(design.sensor.name)
+    for (mount, roll_deg), sensors in names.items():
+        which = f" ({', '.join(sensors)})" if len(names) > 1 else ""
+        yield f"the sensors are {mount}, the roll is kept at {roll_deg:g}°{which}"
 
 
 def _format_gain(design: Design) -> str:

@@ -28,6 +28,7 @@ from egvs.clouds.simulation import CloudSimulator, sweep_rng
 from egvs.clouds.sweeps import Detections, Sweep
 from egvs.core import files
 from egvs.core.errors import RunError
+from egvs.core.main_guard import check_main_guard
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.resource_usage import ResourceUsage, measure_usage
 from egvs.core.threads import thread_count
@@ -344,6 +345,7 @@ def _run_in_pool(
     task: DetectionTask[Any], work: Sequence[_SiteWork], processes: int
 ) -> Generator[_SiteResults, None, None]:
     """Yield results from worker processes; an error or an interrupt ends all of them."""
+    check_main_guard()
     other_processes = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _init_worker, (task,))
     try:

@@ -71,7 +71,7 @@ def validate_sites(
     kitti
         KITTI results of further detectors, and whether to write ground truth and detections as KITTI files.
     jobs
-        Number of processes; one per core when None.
+        Number of processes; one per core when None. With several, a script needs ``if __name__ == "__main__":``.
     listener
         Receives the progress of the detectors.
 

@@ -6,6 +6,8 @@ Evidence: simulated sweeps in a yard of known pose; rooms with equal walls; heig
 from __future__ import annotations
 
 import json
+import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -164,8 +166,13 @@ def test_command_fits_a_sensor_that_is_upside_down(tmp_path: Path, run_egvs: Any
     code, _, error = run_egvs(*arguments)
     assert code == 2
     assert "expected a ground plane below the sensor, got none" in error and "with --mount inverted" in error
-    code, _, error = run_egvs(*arguments, "--mount", "inverted")
+    code, printed, error = run_egvs(*arguments, "--mount", "inverted")
     assert code == 0, error
+    assert "The sensor is upside down" in printed
+    text = (tmp_path / "made" / "sensor.toml").read_text(encoding="utf-8")
+    assert tomllib.loads(text)["sensors"]["mast"]["mount"] == "inverted"
+    (roll,) = re.findall(r"upside down, roll (\S+) from there", text)
+    assert float(roll) == pytest.approx(1.5, abs=0.1)
     (plane, *_) = json.loads((tmp_path / "made" / "fit.json").read_text(encoding="utf-8"))["ground_planes"]
     assert plane["height_m"] == pytest.approx(truth.height_m, abs=0.02)
     assert (plane["roll_deg"], plane["pitch_deg"]) == pytest.approx((1.5 - 180.0, -4.0), abs=0.1)

@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from egvs.extensions.validation.measured.sensor_site import move_boxes
 from egvs.formats import pcd
+from egvs.sensors.sensor import CATALOGUE, rotation_world_sensor
+from egvs.sensors.sensor_table import format_sensor_table, sensor_keys
 from tests.extensions.validation.measured import twin
 from tests.extensions.validation.measured.test_comparison import LOSSES
 from tests.extensions.validation.measured.twin import SENSOR
@@ -137,3 +140,98 @@ def test_world_and_pose_of_a_scenario(folder: Path, mini: Path, tmp_path: Path, 
     assert np.abs(np.subtract(*simulated)).max() <= 0.05 * np.max(simulated)
     code, _, error = run_egvs("validate", mini, "--site", "pole", *common, tmp_path / "none")
     assert code == 2 and "--site: expected one of 1 sites, got 'pole'" in error
+
+
+def in_frame(folder: Path, made: twin.Twin, rotation: np.ndarray) -> Path:
+    """Write sweeps and labels of a twin turned into another frame."""
+    folder.mkdir()
+    points_m = [points @ rotation.T for points in made.points_m]
+    boxes = [move_boxes(boxes, rotation, np.zeros(3)) for boxes in made.boxes]
+    turned = twin.Twin(points_m, boxes)
+    twin.write_pcd(folder, turned)
+    twin.write_openlabel(folder, turned)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made() -> twin.Twin:
+    return twin.make_twin(LOSSES, seed=6, sweeps=1, cars=8)
+
+
+TURN = np.diag([1.0, -1.0, -1.0])
+
+
+def write_mast(mini: Path, roll_deg: float) -> None:
+    """A mast of the twin's height far from the building."""
+    row = f"mast,-80,40,{twin.POSE.z_m},90,{twin.POSE.pitch_deg},{roll_deg}"
+    (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg\n{row}\n", encoding="utf-8")
+
+
+def counts(path: Path) -> np.ndarray:
+    """Simulated and measured points of each box, (n, 2)."""
+    boxes = json.loads((path / "against.json").read_text(encoding="utf-8"))["boxes"]
+    return np.array([[box["simulated"], box["measured"]] for box in boxes])
+
+
+def test_frames_of_sweeps_give_the_same_points(made: twin.Twin, mini: Path, tmp_path: Path, run_egvs: Any) -> None:
+    """A sensor upside down whose beams are those of an upright one in the world, with and without a site."""
+    common = ("--sensor", SENSOR, "--detector", "points", "--out")
+    plain = in_frame(tmp_path / "plain", made, np.eye(3))
+    code, _, error = run_egvs("validate", "--against", plain, "--labels", plain, *common, tmp_path / "a")
+    assert code == 0, error
+    expected = counts(tmp_path / "a")
+
+    hung = in_frame(tmp_path / "hung", made, TURN)
+    write_mast(mini, twin.POSE.roll_deg)
+    upright = CATALOGUE[SENSOR]
+    keys = sensor_keys(upright) | {"mount": "inverted", "elevations_deg": [-value for value in upright.elevations_deg]}
+    keys["azimuth_offsets_deg"] = [-value for value in upright.azimuth_offsets_deg]
+    with (mini / "scenario.toml").open("a", encoding="utf-8") as file:
+        file.write(format_sensor_table("hung", keys))
+    common = ("--sensor", "hung", "--detector", "points", "--out")
+    for number, site in enumerate(((), ("--site", "mast"))):
+        arguments = (mini, *site, "--set", "sites.replace_sensor=hung", "--against", hung, "--labels", hung)
+        code, _, error = run_egvs("validate", *arguments, *common, tmp_path / f"b{number}")
+        assert code == 0, error
+        found = counts(tmp_path / f"b{number}")
+        assert found[:, 1].tolist() == expected[:, 1].tolist()
+        assert np.abs(found[:, 0] - expected[:, 0]).max() <= 0.1 * expected[:, 0].max()
+        assert "mount = 'inverted'" in (tmp_path / f"b{number}" / "sensor.toml").read_text(encoding="utf-8")
+
+    level = in_frame(tmp_path / "level", made, rotation_world_sensor(0.0, -20.0, 0.0))
+    write_mast(mini, twin.POSE.roll_deg)
+    arguments = (mini, "--site", "mast", "--against", level, "--labels", level)
+    code, _, error = run_egvs("validate", *arguments, *common, tmp_path / "c")
+    assert code == 2 and "the ground of the sweeps is not that below site mast" in error
+
+
+def test_levelled_sweeps_are_told(made: twin.Twin, mini: Path, tmp_path: Path, run_egvs: Any) -> None:
+    """The pose of the site is tilted and upside down; the sweeps are those of a program that levels them."""
+    pose = twin.POSE
+    level = in_frame(tmp_path / "level", made, rotation_world_sensor(0.0, pose.pitch_deg, pose.roll_deg))
+    plain = in_frame(tmp_path / "plain", made, np.eye(3))
+    common = ("--labels", level, "--sensor", SENSOR, "--detector", "points", "--out")
+    row = f"mast,-80,40,{pose.z_m},90,-6,0"
+    (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg\n{row}\n", encoding="utf-8")
+    for key in ("sites.mount=upright", "sites.mount=inverted"):
+        arguments = (mini, "--site", "mast", "--set", key, "--against", level)
+        code, printed, error = run_egvs("validate", *arguments, *common, tmp_path / key[-8:])
+        assert code == 0, error
+        assert "The sweeps are levelled" in printed.replace("\n", " ")
+        assert counts(tmp_path / key[-8:])[:, 1].sum() > 0
+    assert counts(tmp_path / "=upright")[:, 0].sum() > 0  # upside down, this sensor looks at the sky
+    write_mast(mini, pose.roll_deg)
+    arguments = (mini, "--site", "mast", "--set", "sites.mount=inverted", "--against", plain, "--labels", plain)
+    code, _, error = run_egvs("validate", *arguments, "--sensor", SENSOR, "--out", tmp_path / "no")
+    assert code == 2 and "the sweeps are upside down for site mast" in error and "sites.mount=upright" in error
+
+
+def test_other_rings_are_told_and_nothing_is_fitted(folder: Path, tmp_path: Path, run_egvs: Any) -> None:
+    common = ("--against", folder, "--labels", folder, "--detector", "points", "--out", tmp_path / "out")
+    code, printed, error = run_egvs("validate", *common, "--sensor", "OS1-64 2048")
+    assert code == 0, error
+    assert "The rings do not match" in printed and f"The nearest sensor of the catalogue is {SENSOR}." in printed
+    assert "No losses are fitted." in printed and "[sensors." not in printed
+    code, printed, error = run_egvs("validate", *common, "--sensor", SENSOR)
+    assert code == 0, error
+    assert "rings do not match" not in printed

@@ -14,6 +14,7 @@ from egvs.extensions.hardware.fit.empty_scan import TRAFFIC, UNKNOWN
 from egvs.extensions.hardware.fit.fit import SensorFit
 from egvs.extensions.hardware.fit.sweep_layout import axis_distances_m, nearest_ring
 from egvs.sensors.sensor import rotation_world_sensor
+from egvs.sensors.sites import Pose
 from egvs.statistics.intervals import Estimate
 from egvs.world.mesh import World
 
@@ -137,6 +138,17 @@ def draw_ranges(fit: SensorFit) -> Figure:
     return figure
 
 
+def describe_roll(roll_deg: float, digits: int = 2) -> str:
+    """Return a roll as sites count it: from upside down, with these words before, for a sensor that is.
+
+    >>> describe_roll(1.5), describe_roll(-178.5)
+    ('roll 1.50', 'upside down, roll 1.50 from there')
+    """
+    pose = Pose(0.0, 0.0, 0.0, roll_deg=roll_deg)
+    roll = f"roll {pose.side_tilt_deg:z.{digits}f}"
+    return f"upside down, {roll} from there" if pose.is_inverted else roll
+
+
 def draw_ground(fit: SensorFit) -> Figure:
     """The chosen ground plane from above and from the side, and the share of returns from the road."""
     figure, axes = _figure(15.0, 9.6, 2, 2)
@@ -162,16 +174,20 @@ def draw_ground(fit: SensorFit) -> Figure:
             axis.plot([], [], "s", color=colour, label=label)
         axis.plot(0, 0, "^", color=_RED, label="sensor")
     above.set(xlabel="x (m)", ylabel="y (m)", xlim=(-_VIEW_M, _VIEW_M), ylim=(-_VIEW_M, _VIEW_M), aspect="equal")
-    above.set_title("From above, in the sensor's frame")
+    is_inverted = fit.plane.is_inverted
+    if is_inverted:  # its y and z axes are drawn as in the world, the road below
+        above.set_ylim(_VIEW_M, -_VIEW_M)
+    above.set_title(f"From above, in the frame of the sensor{', which is upside down' if is_inverted else ''}")
     above.legend(loc="upper left", fontsize=8, bbox_to_anchor=(1.02, 1.0))
     deepest = min(-1.3 * max(plane.height_m for plane in fit.planes), -2.0)
     for axis, name, slope in ((side, "x", 0), (across, "y", 1)):
         line = np.array([-_VIEW_M, _VIEW_M])
         normal = fit.plane.normal
         axis.plot(line, -(fit.plane.height_m + normal[slope] * line) / normal[2], color="black", linewidth=0.8)
-        limits_m = (deepest, 2.0) if normal[2] > 0.0 else (-2.0, -deepest)
-        axis.set(xlabel=f"{name} (m)", ylabel="z (m)", xlim=(-_VIEW_M, _VIEW_M), ylim=limits_m)
-    side.set_title(f"From the side: roll {fit.plane.roll_deg:.2f}, pitch {fit.plane.pitch_deg:.2f} degrees")
+        limits_m = (-deepest, -2.0) if is_inverted else (deepest, 2.0)
+        left_m = _VIEW_M if is_inverted and slope else -_VIEW_M
+        axis.set(xlabel=f"{name} (m)", ylabel="z (m)", xlim=(left_m, -left_m), ylim=limits_m)
+    side.set_title(f"From the side: {describe_roll(fit.plane.roll_deg)}, pitch {fit.plane.pitch_deg:.2f} degrees")
     across.set_title("Along the sensor's x axis")
     _bars(rates, [(b.from_m, b.to_m, b.rate) for b in fit.road_rates], 100.0, _GREEN, "from the road alone")
     _bars(rates, [(b.from_m, b.to_m, b.rate) for b in fit.rates_towards_road], 100.0, _GREY, "from vehicles as well")

@@ -31,7 +31,7 @@ from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.effects.range_limit import RangeLimit
 from egvs.effects.returns import ReturnProbability
 from egvs.extensions.validation.detectors.base import make_detector
-from egvs.extensions.validation.measured import return_fit, sensor_site, yaw_conventions
+from egvs.extensions.validation.measured import return_fit, sensor_site, sweep_frame, yaw_conventions
 from egvs.extensions.validation.measured.box_points import BOTTOM_M, points_in_boxes
 from egvs.extensions.validation.measured.detection import DetectionRow, DetectorTask, detection_row
 from egvs.extensions.validation.measured.ratios import Ratio, ratio_of_sums
@@ -257,12 +257,14 @@ def compare_labelled(request: ComparisonRequest, scenario: Scenario | None = Non
         raise InputError(request.labels[0], "expected boxes of road users, got none", "Give labels with boxes.")
 
     site = _find_site(request, scenario, [sweep for sweep, _ in pairs])
+    other_rings = sweep_frame.describe_other_rings(site, [sweep for sweep, _ in pairs])
+    site, pairs = sweep_frame.stand_upright(site, pairs)
     model = return_model(site, scenario)
     frames = [site.frame(number, item) for number, (_, item) in enumerate(pairs)]
     hits = [BoxBeams.cast(site, frame) for frame in frames]
     visible = visible_boxes(site, frames, model)
     points = _count_points(pairs, site, hits, model)
-    fit = None if model is None else _fit_cars(points, hits, frames, model)
+    fit = None if model is None or other_rings else _fit_cars(points, hits, frames, model)
     levels = _levels(site, frames, points, model, fit)
     return Comparison(
         site=site,
@@ -274,7 +276,12 @@ def compare_labelled(request: ComparisonRequest, scenario: Scenario | None = Non
         levels=tuple(levels),
         detections=tuple(_detections(request.detectors, site, pairs, frames, points, visible, model)),
         convention=convention,
-        notes=(*site.assumptions, *notes, *_few_objects(points, pairs, fit, model)),
+        notes=(
+            *([f"{other_rings} No losses are fitted."] if other_rings else []),
+            *site.assumptions,
+            *notes,
+            *_few_objects(points, pairs, fit, model, has_rings=not other_rings),
+        ),
     )
 
 
@@ -282,7 +289,8 @@ def compare_unlabelled(request: ComparisonRequest, scenario: Scenario | None = N
     """Return which returns of several sweeps of one place repeat; parameters and errors as :func:`compare_labelled`."""
     sweeps = _read_sweeps(request)
     sensor = sensor_site.find_sensor(request.sensor, scenario)
-    return measure_repetition(sensor_site.on_ground_plane(sensor, sweeps), sweeps)
+    turned = sensor_site.is_inverted(sensor, scenario)
+    return measure_repetition(sensor_site.on_ground_plane(sensor, sweeps, is_inverted=turned), sweeps)
 
 
 def _read_sweeps(request: ComparisonRequest) -> list[Sweep]:
@@ -295,10 +303,11 @@ def _read_sweeps(request: ComparisonRequest) -> list[Sweep]:
 
 def _find_site(request: ComparisonRequest, scenario: Scenario | None, sweeps: Sequence[Sweep]) -> SensorSite:
     if scenario is not None and (request.site is not None or request.sensor is None):
-        return sensor_site.in_scenario(scenario, request.site, request.sensor)
+        return sweep_frame.find_frame(sensor_site.in_scenario(scenario, request.site, request.sensor), sweeps)
     if request.site is not None:
         raise InputError("--site", "expected a scenario with this site, got none", "Name the scenario.")
-    return sensor_site.on_ground_plane(sensor_site.find_sensor(request.sensor, scenario), sweeps)
+    sensor = sensor_site.find_sensor(request.sensor, scenario)
+    return sensor_site.on_ground_plane(sensor, sweeps, is_inverted=sensor_site.is_inverted(sensor, scenario))
 
 
 def return_model(site: SensorSite, scenario: Scenario | None) -> ReturnModel | None:
@@ -515,7 +524,8 @@ def _detections(
     chosen = [make_detector(name) for name in names]
     if not chosen:
         return
-    task = DetectorTask.of(site, [sweep.points_m for sweep, _ in pairs], frames, model)
+    points_m = [sweep_frame.in_sensor_frame(site, sweep.points_m) for sweep, _ in pairs]
+    task = DetectorTask.of(site, points_m, frames, model)
     for detector in chosen:
         found, chances = task.run(detector), None
         if detector.NAME in MODELLED:
@@ -532,8 +542,10 @@ def _few_objects(
     pairs: Sequence[tuple[Sweep, SweepLabels]],
     fit: ReturnFit | None,
     model: ReturnModel | None,
+    *,
+    has_rings: bool,
 ) -> list[str]:
-    """Return sentences on what these labels cannot tell."""
+    """Return sentences on what these labels cannot tell; ``has_rings`` says whether the rings are the sensor's."""
     notes = []
     if not all(item.has_tracks for _, item in pairs) and len(pairs) > 1:
         notes.append("The labels have no tracks: each box counts as an object of its own, so errors are too small.")
@@ -546,6 +558,8 @@ def _few_objects(
         )
     if model is None:
         notes.append("The sensor has no rated range, so no losses are simulated or fitted: add rated_range_m.")
+    elif not has_rings:
+        pass
     elif fit is None and objects >= return_fit.MIN_OBJECTS and points.measured[cars].any():
         low_m, high_m = return_fit.LIMITS_M[[0, -1]]
         notes.append(

@@ -55,6 +55,8 @@ class SensorSite:
         Share of its beam of each row, (n,) float64.
     assumptions
         Sentences on what is assumed of the world.
+    sweep_pose
+        Pose of the frame of points and boxes; None for that of the sensor.
     """
 
     name: str
@@ -66,10 +68,16 @@ class SensorSite:
     returned: np.ndarray[tuple[int], np.dtype[np.bool_]]
     weight: FloatArray
     assumptions: tuple[str, ...]
+    sweep_pose: Pose | None = None
+
+    @property
+    def frame_pose(self) -> Pose:
+        """Pose of the frame of points and boxes."""
+        return self.sweep_pose or self.pose
 
     def to_world(self, boxes: FloatArray) -> FloatArray:
-        """Return boxes of the sensor's frame (n, 7) in the world: upright, headed along the projection of their own."""
-        return boxes_in_world(self.pose, boxes)
+        """Return boxes of the sweeps (n, 7) in the world: upright, headed along the projection of their own."""
+        return boxes_in_world(self.frame_pose, boxes)
 
     def frame(self, number: int, labels: SweepLabels) -> TrafficFrame:
         """Return the labelled boxes of a sweep as a frame of traffic."""
@@ -91,11 +99,30 @@ def move_boxes(boxes: FloatArray, rotation: FloatArray, translation_m: FloatArra
     return moved
 
 
-def on_ground_plane(sensor: Sensor, sweeps: Sequence[Sweep]) -> SensorSite:
-    """Return a site above the ground plane that is fitted to sweeps; InputError if they show none."""
+def upright_normals(points_m: FloatArray) -> FloatArray:
+    """Return normals that let all points (n, 3) be on the ground."""
+    return np.broadcast_to(_UP, points_m.shape)
+
+
+def on_ground_plane(sensor: Sensor, sweeps: Sequence[Sweep], *, is_inverted: bool = False) -> SensorSite:
+    """Return a site above the ground plane that is fitted to sweeps; InputError if they show none.
+
+    Parameters
+    ----------
+    sensor
+        The sensor.
+    sweeps
+        In its frame.
+    is_inverted
+        Whether it is upside down, so that z of its frame points downwards.
+    """
     returns = [sweep.points_m[np.isfinite(sweep.points_m[:, 0])] for sweep in sweeps]
     points_m = np.concatenate(returns)
-    plane = find_ground_planes(points_m, np.broadcast_to(_UP, points_m.shape), sweeps[0].name)[0]
+    if is_inverted:
+        points_m = points_m * (1.0, -1.0, -1.0)
+    plane = find_ground_planes(points_m, upright_normals(points_m), sweeps[0].name)[0]
+    if is_inverted:
+        plane = plane.upside_down()
     pose = Pose(0.0, 0.0, plane.height_m, 0.0, plane.pitch_deg, plane.roll_deg)
     directions = sensor.directions(*pose.angles_deg)
     range_m = np.full(len(directions), float(sensor.range_m))
@@ -208,6 +235,14 @@ def _choose(sites: Sequence[Site], name: str | None) -> Site:
         problem = f"expected one of {len(sites):,} sites, got {name!r}"
         raise InputError("--site", problem, f"Use --site {sites[0].name}.")
     return by_name[name]
+
+
+def is_inverted(sensor: Sensor, scenario: Scenario | None) -> bool:
+    """Return whether a scenario says that a sensor, or the sensors of all sites, hang upside down."""
+    if scenario is None:
+        return False
+    own = scenario.sensors.get(sensor.name)
+    return (scenario.sites.mount or ("upright" if own is None else own.mount)) == "inverted"
 
 
 def find_sensor(name: str | None, scenario: Scenario | None) -> Sensor:

@@ -158,6 +158,8 @@ def fitted_table(comparison: Comparison) -> str:
         "softness": round(fit.softness, 2),
         "dropout": fit.dropout,
     }
+    if comparison.site.pose.is_inverted:
+        keys["mount"] = "inverted"
     lines = [
         f"# Losses fitted to {number_of(fit.vehicles, 'labelled box', 'labelled boxes')} of "
         f"{number_of(fit.objects, 'car')}, at a reflectivity of cars of {model.target_reflectivity():g}."
