@@ -321,7 +321,7 @@ def print_check(checked: CheckReport, *, with_details: bool = False) -> None:
         if hidden := len(checked.poles) - len(shown):
             out.print(f"{hidden} more poles; --verbose lists them")
         out.print("kerb: distance to the edge of the carriageway; wall: to the nearest building or other surface")
-    for severity, findings in (("error", checked.errors), ("warning", checked.warnings)):
+    for severity, findings in (("error", checked.errors), ("warning", checked.warnings), ("note", checked.notes)):
         if not findings:
             continue
         plural = "s" if len(findings) > 1 else ""
@@ -331,7 +331,7 @@ def print_check(checked: CheckReport, *, with_details: bool = False) -> None:
             for finding in findings:
                 if finding.rule == rule:
                     out.print(f"    {finding}")
-    if not checked.findings:
+    if not (checked.errors or checked.warnings):
         out.print("no errors or warnings")
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
 
