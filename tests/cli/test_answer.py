@@ -16,6 +16,7 @@ from egvs.report import ranking_text, sections
 from egvs.report.reliability import by_severity, describe_reliability
 from egvs.results.plans import SensorPlan
 from egvs.results.ranking import Ranking
+from egvs.traffic import trajectories
 from tests.report.small_runs import PageReader
 from tests.results.test_ranking import by_vehicles
 
@@ -113,6 +114,25 @@ def test_a_pole_in_a_lane_is_named_whatever_else_is_warned_of(
     record.stages["check"].summary[WARNINGS_KEY] = [in_lane.to_json()]
     answer.print_answer(out, scenario, record)
     assert f"\nCareful: {best} stands in a lane of Mill Lane.\n" in capsys.readouterr().out
+
+
+def test_vehicles_that_could_not_start_are_a_caveat_of_answer_report_and_plan(
+    mini: Path, tmp_path: Path, run_egvs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = "1,542 of 2,887 vehicles could not start, because the streets where they start are full"
+    warnings = [
+        Diagnostic("overlaps", "traffic", "vehicles overlap", ""),
+        Diagnostic("waiting", "traffic", problem, ""),
+    ]
+    monkeypatch.setattr(trajectories, "traffic_warnings", lambda *_: warnings)
+    careful = "Careful: 1,542 of 2,887 vehicles could not start, so the traffic is less than the demand."
+    for options in ((), ("--verbose",)):
+        code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out", *options)
+        assert code == 0, error
+        assert careful in printed
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert careful in page[: page.index("<main>")]
+    assert careful in " ".join(run_egvs("place", mini, "--out", tmp_path / "out", "--count", "1")[1].split())
 
 
 def test_plans_in_one_go(six_poles: Path, tmp_path: Path, run_egvs) -> None:

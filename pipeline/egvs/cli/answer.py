@@ -110,7 +110,9 @@ def _print_short(
     after = []
     if record.stages["score"].summary.get("missed") and (worst := _worst_location(folder, best)):
         after += wrap_lines(f"Worst lane: {worst}.", 1)
-    if on_road := sections.describe_poles_on_road(ranked.poles[:MIN_POLES], _check_warnings(record)):
+    if missing := sections.describe_missing_traffic(_warnings(record)):
+        after += wrap_lines(missing, 1)
+    if on_road := sections.describe_poles_on_road(ranked.poles[:MIN_POLES], _warnings(record)):
         after += wrap_lines(f"Careful: {join_names(on_road)}.", 1)
     plans = record.traffic_summary.get("signals", ())
     if assumed := sections.main_assumptions(sections.assumptions(scenario, plans)):
@@ -162,7 +164,9 @@ def _print_details(
     traffic_summary = record.traffic_summary
     plans = traffic_summary.get("signals", ())
     sentences = signal_sentences(plans)
-    on_road = sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record))
+    on_road = sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _warnings(record))
+    if missing := sections.describe_missing_traffic(_warnings(record)):
+        sentences.append(missing)
     if caveats := sections.describe_caveats(scenario, "ranking", on_road, plans):
         sentences.append(caveats)
     sentences += reliability.describe_reliability(ranked, traffic_summary, scenario.score.ranking_detectors)
@@ -190,10 +194,8 @@ def signal_sentences(plans: Sequence[Mapping[str, Any]]) -> list[str]:
     return sentences
 
 
-def _check_warnings(record: RunRecord) -> list[Diagnostic]:
-    if "check" not in record.stages:
-        return []
-    return collect_warnings([record.stages["check"].summary])
+def _warnings(record: RunRecord) -> list[Diagnostic]:
+    return collect_warnings(stage.summary for stage in record.stages.values())
 
 
 def flow_source(scenario: Scenario) -> str:

@@ -13,7 +13,7 @@ import typer
 
 from egvs.cli import options, sources
 from egvs.cli.options import Detector, Jobs, Out, Set, SettingsPath
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, collect_warnings
 from egvs.core.wording import by_number, format_percent, number_of
 
 if TYPE_CHECKING:
@@ -98,8 +98,9 @@ def place(
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
     if replaced is not None and (outdated := outdated_handovers(folder, earlier, placed)):
         notes.append(outdated)
-    plans = RunRecord.read(folder).traffic_summary.get("signals", ())
-    caveats = [sections.main_assumptions(sections.assumptions(loaded, plans))]
+    traffic = RunRecord.read(folder).traffic_summary
+    assumed = sections.assumptions(loaded, traffic.get("signals", ()))
+    caveats = [sections.describe_missing_traffic(collect_warnings([traffic])), sections.main_assumptions(assumed)]
     if placed.fused is not None and placed.fused.noticed is not None:
         caveats.append(sensor_text.upper_limit_note(loaded, [sensor.sensor for sensor in placed.sensors]))
     found, has_relief = _plan_level(loaded, folder, placed), sites.has_relief(loaded)

@@ -201,7 +201,8 @@ _TRACK_COUNTS = {
 
 
 def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
-    yield Sentence(f"{rest.pop('boxes_in_roi'):.1f} vehicles in the region on average")
+    users = "road users" if rest.pop("with_people", False) else "vehicles"
+    yield Sentence(f"{rest.pop('boxes_in_roi'):.1f} {users} in the region on average")
     yield _detail(f"{number_of(rest.pop('occupied_voxels'), 'voxel')} occupied at least once")
     yield _detail(f"{rest.pop('static_voxels'):,} filled by static solids")
     memory = rest.pop("memory_frames")

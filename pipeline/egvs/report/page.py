@@ -54,6 +54,7 @@ from egvs.report.sections import (
     assumptions,
     busiest_counts,
     describe_counts,
+    describe_missing_traffic,
     describe_poles_on_road,
     main_assumptions,
     study_values,
@@ -560,6 +561,7 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
     assumed = assumptions(contents.scenario, traffic_summary(contents.stages).get("signals", ()))
     return {
         "warnings": by_severity(warnings),
+        "missing_traffic": describe_missing_traffic(warnings),
         "main_assumptions": main_assumptions(assumed),
         "reliability": reliability,
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),

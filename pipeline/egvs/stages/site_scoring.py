@@ -126,7 +126,8 @@ def zone_users(context: StageContext) -> ZoneUsers:
         carriageway = Carriageway.of(network)
     period = _period_of_rows(record, recorded)
     detectors = context.scenario.score.detectors
-    return ZoneUsers.of(record, reported_zones(context.scenario), weight, period, carriageway, detectors)
+    users = ZoneUsers.of(record, reported_zones(context.scenario), weight, period, carriageway, detectors)
+    return replace(users, is_recorded=context.scenario.is_recorded)
 
 
 class TargetScorer:

@@ -428,7 +428,7 @@ def print_design(result: DesignResult, file: Path | None) -> None:
     columns: list[Column[Design]] = [
         Column("sensor", _sensor_words, align="left"),
         Column("height m", lambda design: f"{design.pose.z_m - result.ground_m:.2f}"),
-        Column("ccw yaw deg", lambda design: f"{design.pose.yaw_deg:.1f}"),
+        Column("yaw deg", lambda design: f"{design.pose.yaw_deg:.1f}"),
         Column("pitch deg", lambda design: f"{design.pose.pitch_deg:.1f}"),
         Column("found, frames of the search", lambda design: format_percent(design.search_score)),
         Column("found, other frames", lambda design: f"{100 * design.score:.1f} ± {100 * design.se:.1f} %"),
