@@ -264,7 +264,7 @@ def test_rejects_rule_without_feasible_candidate(street: Path) -> None:
 def test_rejects_visibility_of_dropped_site(street: Path) -> None:
     rule(street, "{ low_m=[6,-6], high_m=[6,-1], spacing_m=5, heights_m=[3.0] }")
     told = found(street, 'score.keep_visibility=["g02"]')
-    assert told == {"sites": ["scenario.toml: score.keep_visibility: the site 'g02' is dropped: it stands in a lane"]}
+    assert told == {"sites": ["command line: score.keep_visibility: the site 'g02' is dropped: it stands in a lane"]}
 
 
 def test_warns_of_beams_that_miss_region(street: Path) -> None:
@@ -543,8 +543,8 @@ def test_reports_missing_files_and_unknown_formats(street: Path) -> None:
     (street / "scan.xyz").write_text("")
     told = found(street, 'statics.polygons=["gone.poly.xml"]', 'sensors.own={beams="beams.csv",range_m=50}')
     assert {line.partition(": no such")[0] for line in told["files"][:3]} == {
-        "scenario.toml: statics.polygons = 'gone.poly.xml'",
-        "scenario.toml: sensors.own.beams = 'beams.csv'",
+        "command line: statics.polygons = 'gone.poly.xml'",
+        "command line: sensors.own.beams = 'beams.csv'",
         "scenario.toml: site a: points = 'gone.pcd'",
     }
     assert "scan.xyz" in told["files"][3]
