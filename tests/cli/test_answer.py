@@ -1,7 +1,9 @@
 """The answer at the end of ``egvs run``."""
 
 import re
+import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -60,6 +62,23 @@ def test_the_answer_has_twelve_lines(six_poles: Path, tmp_path: Path, run_egvs) 
     assert "Assumed, not measured: traffic (guessed); positions of the poles and 2 more." in lines
     assert lines[-1].startswith(f"report: {out / 'report.html'} ")
     assert len(answer_lines(*run_egvs("run", six_poles, *settings, "--top", "6")[1:])) > len(lines)
+
+
+def finer_tilts(best_deg: float, tried_deg: tuple[float, ...]) -> str:
+    """The hint for a pole "Ampel Nord" with these tilts; at each, with another sensor too."""
+    mounts = [SimpleNamespace(pole="Ampel Nord", sensor="VLP-32C", pitch_deg=pitch_deg) for pitch_deg in tried_deg]
+    best = next(mount for mount in mounts if mount.pitch_deg == best_deg)
+    others = [SimpleNamespace(pole="Ampel Nord", sensor="other", pitch_deg=-90.0 + 1.0 * i) for i in range(180)]
+    ranked = SimpleNamespace(best=(best,), poles=(SimpleNamespace(name="Ampel Nord", sites=(*mounts, *others)),))
+    return answer._finer_tilts(RunFolder(Path("my run")), ranked)  # type: ignore[arg-type]
+
+
+def test_hints_at_finer_tilts_where_the_best_one_is_at_the_edge_or_between_coarse_ones() -> None:
+    command = ["Finer", "tilts:", "egvs", "sensor", "design", "my run", "--pole", "Ampel Nord"]
+    for best_deg, tried_deg in ((0.0, (0.0, -5.0, -10.0)), (-10.0, (0.0, -5.0, -10.0)), (-10.0, (0.0, -10.0, -20.0))):
+        assert shlex.split(finer_tilts(best_deg, tried_deg)) == command
+    assert finer_tilts(-5.0, (0.0, -5.0, -10.0)) == ""
+    assert finer_tilts(0.0, (0.0,)) == ""
 
 
 def test_no_fact_is_lost_in_the_report_and_with_verbose(six_poles: Path, tmp_path: Path, run_egvs) -> None:
