@@ -110,7 +110,7 @@ def _detail(text: str) -> Sentence:
 def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
     sites, solids, lanes = rest.pop("sites"), summary["solids"], rest.pop("lanes")
     yield Sentence(f"{number_of(sites, 'site')}, {number_of(solids, 'solid')} and {number_of(lanes, 'lane')} checked")
-    for note in rest.pop("losses", ()):
+    for note in (*rest.pop("losses", ()), *rest.pop("notes", ())):
         yield _detail(note)
 
 

@@ -388,7 +388,9 @@ class PlacementConfig(StrictModel):
     reach: Share | None = Field(
         None, description="Find the fewest sensors that reach this share of the score of all candidates together"
     )
-    forced: tuple[str, ...] = Field((), description="Candidates that exist already and are part of every plan")
+    forced: tuple[str, ...] = Field(
+        (), description="Candidates, or poles with one, that exist already and are part of every plan"
+    )
     excluded: tuple[str, ...] = Field((), description="Candidates or poles that must not be used")
     most_per_pole: int | None = Field(None, ge=1, description="Maximum number of sensors on a pole. By default any")
     least_distance_m: NotNegative = Field(0.0, description="Minimum distance between any two sensors")
