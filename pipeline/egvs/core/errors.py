@@ -80,6 +80,13 @@ def check_instance(name: str, value: object, kind: type, source: str) -> None:
         raise InputError(name, f"expected a {kind.__name__}, got {truncate_text(got)}", f"Use {source}.")
 
 
+def check_list(name: str, value: object) -> None:
+    """Raise an InputError if an argument that lists texts is one text, whose letters would be taken one by one."""
+    if isinstance(value, str):
+        text = truncate_text(repr(value))
+        raise InputError(name, f"expected a list of texts, got {text}", f"Write brackets: {name}=[{text}].")
+
+
 class RunError(EgvsError):
     """The input is valid, but the run could not do what it asks for (for example: N vehicles in every frame)."""
 
