@@ -15,7 +15,7 @@ import pytest
 import shapely
 
 import egvs
-from egvs.artefacts import readers, traffic_frames
+from egvs.artefacts import frame_boxes, readers, traffic_frames
 from egvs.artefacts.readers import ZoneVisibility
 from egvs.core.errors import InputError
 from egvs.formats import georeference
@@ -32,7 +32,7 @@ from egvs.world.carriageway import Carriageway
 from tests.conftest import collection, feature
 from tests.scoring.target_scenes import GRID, frame
 
-PEOPLE = traffic_frames.NON_VEHICLE_KINDS
+PEOPLE = frame_boxes.NON_VEHICLE_KINDS
 
 
 def square(west: float, south: float, east: float, north: float) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from pydantic import (
     model_validator,
 )
 
-from egvs.core import limits, plugins
+from egvs.core import errors, limits, plugins
 from egvs.scenario.fields import Name, NotNegative, Point2, Positive, StrictModel, find_duplicates
 
 VehicleClass = Literal[
@@ -53,7 +53,9 @@ def is_plugin_score(name: str) -> bool:
 def _check_ranking_score(name: str) -> str:
     """Return the name of a score that can rank sites; ValueError for any other, and for one that is not installed."""
     if name not in (known := [*get_args(RankingScore), *plugin_scores()]):
-        raise ValueError(f"expected one of {', '.join(known)}, got {name[:80]!r}")
+        problem = f"expected one of {', '.join(known)}, got {name[:80]!r}"
+        misspelling = errors.find_misspelling([name], known)
+        raise ValueError(f"{problem}; did you mean {misspelling[1]!r}?" if misspelling else problem)
     return name
 
 

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.artefacts.frame_boxes import FrameBoxes
-from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS, FrameBoxes
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.wording import format_percent

@@ -140,6 +140,7 @@ def test_recording_of_pedestrians_only(mini: Path, run_egvs, tmp_path: Path) -> 
     use_tracks(mini, interaction_csv(boxes_of_fcd()).replace(",car,", ",pedestrian,"))
     make_tpog(run_egvs, mini, tmp_path / "run")
     assert read_tpog(tmp_path / "run" / "tpog.parquet").counts.any()
+    assert RunRecord.read(tmp_path / "run").stages["tpog"].summary["with_people"]
 
 
 def test_drops_boxes_outside_coverage(mini: Path, run_egvs, tmp_path: Path) -> None:

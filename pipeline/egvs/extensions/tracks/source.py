@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS
 from egvs.core.errors import Diagnostic, InputError
 from egvs.extensions.tracks import recorded_tracks
 from egvs.extensions.tracks.recorded_tracks import RecordedTracks
