@@ -85,9 +85,9 @@ SESSIONS: tuple[Session, ...] = (
             "egvs run crossing --set traffic.frames=300 --out run",
             "egvs place crossing --set traffic.frames=300 --set placement.count=1 --out run",
             "egvs sheets run",
-            "egvs accept run --site k02@3m-10deg --scan measured.pcd",
-            "egvs accept run --site k02@3m-10deg --scan corrected.pcd",
-            "egvs accept run --site k02@3m-10deg --scan blocked.pcd",
+            "egvs accept run --site k03@3m-5deg --scan measured.pcd",
+            "egvs accept run --site k03@3m-5deg --scan corrected.pcd",
+            "egvs accept run --site k03@3m-5deg --scan blocked.pcd",
             "egvs run crossing --set traffic.frames=300 --set "
             """'traffic.signals={"East Street / North Street"={file="plan.csv"}}' --out fixed_plan""",
         ),

@@ -1,7 +1,9 @@
 """The answer at the end of ``egvs run``."""
 
 import re
+import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -14,6 +16,7 @@ from egvs.report import ranking_text, sections
 from egvs.report.reliability import by_severity, describe_reliability
 from egvs.results.plans import SensorPlan
 from egvs.results.ranking import Ranking
+from egvs.traffic import trajectories
 from tests.report.small_runs import PageReader
 from tests.results.test_ranking import by_vehicles
 
@@ -61,6 +64,23 @@ def test_the_answer_has_twelve_lines(six_poles: Path, tmp_path: Path, run_egvs) 
     assert len(answer_lines(*run_egvs("run", six_poles, *settings, "--top", "6")[1:])) > len(lines)
 
 
+def finer_tilts(best_deg: float, tried_deg: tuple[float, ...]) -> str:
+    """The hint for a pole "Ampel Nord" with these tilts; at each, with another sensor too."""
+    mounts = [SimpleNamespace(pole="Ampel Nord", sensor="VLP-32C", pitch_deg=pitch_deg) for pitch_deg in tried_deg]
+    best = next(mount for mount in mounts if mount.pitch_deg == best_deg)
+    others = [SimpleNamespace(pole="Ampel Nord", sensor="other", pitch_deg=-90.0 + 1.0 * i) for i in range(180)]
+    ranked = SimpleNamespace(best=(best,), poles=(SimpleNamespace(name="Ampel Nord", sites=(*mounts, *others)),))
+    return answer._finer_tilts(RunFolder(Path("my run")), ranked)  # type: ignore[arg-type]
+
+
+def test_hints_at_finer_tilts_where_the_best_one_is_at_the_edge_or_between_coarse_ones() -> None:
+    command = ["Finer", "tilts:", "egvs", "sensor", "design", "my run", "--pole", "Ampel Nord"]
+    for best_deg, tried_deg in ((0.0, (0.0, -5.0, -10.0)), (-10.0, (0.0, -5.0, -10.0)), (-10.0, (0.0, -10.0, -20.0))):
+        assert shlex.split(finer_tilts(best_deg, tried_deg)) == command
+    assert finer_tilts(-5.0, (0.0, -5.0, -10.0)) == ""
+    assert finer_tilts(0.0, (0.0,)) == ""
+
+
 def test_no_fact_is_lost_in_the_report_and_with_verbose(six_poles: Path, tmp_path: Path, run_egvs) -> None:
     """Each warning, assumption and caveat, the lead, poles and scores."""
     with (six_poles / "sites.csv").open("a") as file:
@@ -94,6 +114,25 @@ def test_a_pole_in_a_lane_is_named_whatever_else_is_warned_of(
     record.stages["check"].summary[WARNINGS_KEY] = [in_lane.to_json()]
     answer.print_answer(out, scenario, record)
     assert f"\nCareful: {best} stands in a lane of Mill Lane.\n" in capsys.readouterr().out
+
+
+def test_vehicles_that_could_not_start_are_a_caveat_of_answer_report_and_plan(
+    mini: Path, tmp_path: Path, run_egvs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = "1,542 of 2,887 vehicles could not start, because the streets where they start are full"
+    warnings = [
+        Diagnostic("overlaps", "traffic", "vehicles overlap", ""),
+        Diagnostic("waiting", "traffic", problem, ""),
+    ]
+    monkeypatch.setattr(trajectories, "traffic_warnings", lambda *_: warnings)
+    careful = "Careful: 1,542 of 2,887 vehicles could not start, so the traffic is less than the demand."
+    for options in ((), ("--verbose",)):
+        code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out", *options)
+        assert code == 0, error
+        assert careful in printed
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert careful in page[: page.index("<main>")]
+    assert careful in " ".join(run_egvs("place", mini, "--out", tmp_path / "out", "--count", "1")[1].split())
 
 
 def test_plans_in_one_go(six_poles: Path, tmp_path: Path, run_egvs) -> None:

@@ -340,7 +340,7 @@ COMMANDS = {
     "--poles= in quotes": (["new", "{out}", "--osm", "x.osm", "--poles=every 20m"], r"x.osm: no such file"),
     "--poles every": (["new", "{out}", "--osm", "x.osm", "--poles", "every", "20m"], r"x.osm: no such file"),
     "--poles=every": (["new", "{out}", "--osm", "x.osm", "--poles=every", "20m"], r"x.osm: no such file"),
-    "--poles no length": (["new", "{out}", "--osm", "x.osm", "--poles", "far"], r"--poles.*2 arguments"),
+    "--poles no length": (["new", "{out}", "--osm", "x.osm", "--poles", "far"], r"--poles: expected existing"),
     "figure without --what": (["figure", "{out}"], r"--what: expected one of ranking, map, tpog, seen, missed"),
     "--count 0": (["place", "{mini}", "--count", "0"], r"^egvs: --count: expected at least 1 sensor, got 0"),
     "--count -1": (["place", "{mini}", "--count", "-1"], r"^egvs: --count: expected at least 1 sensor, got -1"),

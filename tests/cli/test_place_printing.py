@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from io import StringIO
@@ -13,8 +14,11 @@ from rich.console import Console
 
 from egvs.cli import console as cli_console
 from egvs.cli import place
-from egvs.results.levels import NoticedShare
-from egvs.results.plans import FusedPlan, PlannedSensor, PlanStep, SensorPlan
+from egvs.placement import plan
+from egvs.report.plan_section import plan_headline
+from egvs.results.levels import DetectionLevel, GroupLevel, NoticedShare, format_range
+from egvs.results.plans import FusedPlan, PlannedSensor, PlanStep, RefinementSummary, SensorPlan
+from egvs.results.ranking import site_titles
 from egvs.scenario.score_config import PlacementConfig
 
 FIRST_LINE = "The plan a, b should find 99.2 ± 0.3 % of vehicles; proved: no plan within the rules is better.\n"
@@ -93,10 +97,7 @@ def test_values_in_fused_clouds_follow_the_assumption(capsys: pytest.CaptureFixt
         PlanStep(1, 0.9455, 0.9455, True, 0.009, 0.009, 1.0),
         PlanStep(2, 0.9713, 0.0258, True, 0.004, 0.006, 0.999),
     )
-    first = (
-        "In fused clouds, the first 1 and 2 sensors find 94.5 ± 0.9 % and 97.1 ± 0.4 %; the last one adds "
-        "2.6 ± 0.6 percentage points"
-    )
+    first = "In fused clouds, the last sensor adds 2.6 ± 0.6 percentage points"
     assert printed(placed_two(fused=FusedPlan(steps)), capsys).endswith(f"{LAST_LINES}{first}.\n")
     text = printed(placed_two(fused=FusedPlan(steps, searched=True)), capsys)
     assert text.endswith(f"{first}; no swap of one sensor finds more.\n")
@@ -115,7 +116,9 @@ def test_values_in_fused_clouds_follow_the_assumption(capsys: pytest.CaptureFixt
 def test_the_curve_is_printed_only_where_it_has_other_sites(capsys: pytest.CaptureFixture[str]) -> None:
     """Otherwise the table of the plan has what one sensor alone finds."""
     assert "sensors  found together" not in printed(placed_two(), capsys)
-    assert "sensors  found together" in printed(placed_two(sites=(("c",), ("a", "b"))), capsys)
+    text = printed(placed_two(sites=(("c",), ("a", "b"))), capsys)
+    rows = text.partition("sensors  found together")[2].splitlines()
+    assert [row.split()[0] for row in rows[1:4]] == ["1", "2", "±"]  # the plan itself is a row, too
 
 
 def test_a_plan_takes_at_most_250_words(capsys: pytest.CaptureFixture[str]) -> None:
@@ -130,7 +133,7 @@ def test_a_plan_takes_at_most_250_words(capsys: pytest.CaptureFixture[str]) -> N
     caveat = (
         "Assumed, not measured: traffic (1,240 vehicles an hour in 12 movements); positions of the poles and 1 more."
     )
-    place.print_placement(placed, ["replaces the plan for --count 2"], [caveat])
+    place.print_placement(placed, ["replaces the plan for --count 2"], [caveat], CLUSTER)
     assert len(capsys.readouterr().out.split()) <= 250
 
 
@@ -181,9 +184,75 @@ def test_replaced_plan_is_named_by_its_options() -> None:
     assert place.describe_replaced(two, {**two, "count": 3}) == "replaces the plan for --count 2"
     bought = {**two, "count": None, "budget": 30000.0}
     assert place.describe_replaced(bought, two) == "replaces the plan for --budget 30000"
+    assert place.describe_replaced(two, {**two, "refine": {}}) == "replaces the plan for --count 2 without --refine"
+    refined = {**two, "refine": {"move_m": 1.0}}
+    assert place.describe_replaced(refined, two) == "replaces the plan for --count 2 with --refine"
     assert place.describe_replaced(two, {**two, "survives": 1}) == (
         "replaces the plan for --count 2 with other settings in [placement]"
     )
+
+
+CLUSTER = DetectionLevel(("cluster",))
+FUSED = FusedPlan((PlanStep(1, 0.73, 0.73, True, 0.01), PlanStep(2, 0.861, 0.131, True, 0.01)))
+
+
+def test_first_line_has_the_error_of_the_level_and_the_fused_value() -> None:
+    """Whoever quotes the first line quotes what is known; the error of the traffic alone is in the table."""
+    placed = placed_two(fused=FUSED)
+    assert place.describe_plan(placed, CLUSTER).startswith(
+        "The plan a, b should find 99 ± 6 % of vehicles (86 ± 6 % in fused clouds); proved"
+    )
+    unknown = DetectionLevel(("pointpillars_sensor",))
+    assert "The plan a, b has sensors for whose detectors the level was not measured;" in place.describe_plan(
+        placed, unknown
+    )
+    trucks = GroupLevel("larger vehicles", 90, 0.2, 0.8, None, NoticedShare(0.9, None, 0.9, 0.9))
+    cars = GroupLevel("cars", 300, 0.8, 0.7, None, NoticedShare(0.9, None, 0.9, 0.9))
+    detector = DetectionLevel(("cluster",), (cars, replace(trucks, road_users="people")))
+    assert detector.range is not None
+    outside = detector.range.outside
+    assert detector.joint_text(0.7, 0.01) == format_range(0.7 - outside, 0.7 + outside)
+
+
+def test_refined_plan_has_its_score_and_poses_in_the_first_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """A name such as "a@3m+aim" is that of the candidate, which the sensor has left."""
+    placed = placed_two(joint=0.995, refinement=RefinementSummary(0.9922, 1.0, 1.01, 9, 0, 2, 1.0))
+    moved = [
+        replace(row, site=f"{row.site}@3m+aim", z_m=3.1234, pitch_deg=-3.58, score=0.995, score_se=0.002)
+        for row in placed.sensors
+    ]
+    placed = replace(placed, sensors=tuple(moved))
+    line = place.describe_plan(placed)
+    assert line.startswith("The plan pole a, 3.123 m up, tilted 3.6° down; pole b, 3.123 m up, tilted 3.6° down")
+    assert " should find 99.5 ± 0.2 % of vehicles; proved: no plan within the rules is better, at the poses of " in line
+    text = printed(placed, capsys)
+    assert "+aim" not in text.partition("± is one")[0]
+    headline = plan_headline(placed, site_titles(placed.sensors, is_moved=True), CLUSTER)
+    assert headline == (
+        "The plan of 2 sensors should find 100 ± 6 % of vehicles: pole a, 3.123 m up, tilted 3.6° down; "
+        "pole b, 3.123 m up, tilted 3.6° down"
+    )
+
+
+def test_fused_values_of_a_plan_survive_its_file() -> None:
+    values = json.loads(json.dumps(placed_two(fused=FUSED).to_json()))["fused"]
+    assert values == [[0.73, 0.01], [0.861, 0.01]]
+
+
+def test_files_of_the_earlier_plan_are_named(tmp_path: Path) -> None:
+    placed = placed_two()
+    earlier = [plan.mount_of(row) for row in placed.sensors]
+    names = ("geojson/plan.geojson", "geojson/sites.geojson", "x.kml", "../sheets/installation_a.pdf")
+    for name in (f"export/{name}" for name in names):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert place.outdated_handovers(tmp_path, earlier, placed) == ""
+    for other in (earlier[:1], [(*earlier[0][:-2], -10.0, 0.0), earlier[1]]):
+        assert place.outdated_handovers(tmp_path, other, placed) == (
+            "sheets/installation_a.pdf, export/geojson/plan.geojson, export/x.kml show the earlier plan; "
+            "repeat egvs sheets and egvs export."
+        )
+    assert place.outdated_handovers(tmp_path / "sheets", earlier[:1], placed) == ""
 
 
 def test_files_come_last(capsys: pytest.CaptureFixture[str]) -> None:

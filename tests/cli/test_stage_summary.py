@@ -31,6 +31,14 @@ def test_flows_are_compared_with_counts_only_where_some_were_counted() -> None:
     assert described(guessed) == "10 frames; largest GEH against the assumed flows 0.2"
 
 
+def test_occupancy_counts_road_users_where_people_are_among_them() -> None:
+    summary = {"occupied_voxels": 9, "static_voxels": 0, "boxes_in_roi": 4.7, "memory_frames": 1.0}
+    assert "4.7 vehicles in the region on average" in describe_summary("tpog", summary, with_details=False)
+    summary["with_people"] = True
+    text = describe_summary("tpog", summary, with_details=True)
+    assert "4.7 road users in the region on average" in text and "with_people" not in text
+
+
 def report_warnings(capsys: pytest.CaptureFixture[str], state: str, *rules: str, **options: bool) -> list[str]:
     """Return what the display of a command prints of warnings of these rules, of a stage that ends in a state."""
     warnings = [Diagnostic(rule, "scenario.toml", f"a problem of {rule}" * 30, "Do something.") for rule in rules]

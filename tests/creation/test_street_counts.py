@@ -14,6 +14,7 @@ from egvs.creation.junctions import StreetJunction, Streets
 from egvs.creation.openstreetmap import street_network
 from egvs.creation.street_counts import StreetCounts
 from egvs.formats import osm
+from egvs.report.sections import main_assumptions
 from egvs.scenario import loading
 from tests.creation.overpass_server import SMALL
 from tests.installed import needs
@@ -113,7 +114,10 @@ def test_approach_count_is_divided_by_the_assumed_shares(read: Read, crossing: t
     for (_, to_edge), per_hour in rates(counts).items():
         assert per_hour == pytest.approx(300 * assumed[to_edge] / sum(assumed.values()), abs=0.05)
     assert sum(rates(counts).values()) == pytest.approx(300, abs=0.2)
-    assert counts.assumptions == ["turns of the approaches North Street (south)"]
+    assert counts.assumptions == [
+        "turns of the approaches North Street (south)",
+        "no vehicles in uncounted movements: North Street (north), East Street (east), East Street (west)",
+    ]
     assert "divided by the assumed shares: North Street (south)" in counts.notes[0]
 
 
@@ -167,7 +171,27 @@ def test_hours_without_a_vehicle_are_left_out_with_a_note(read: Read) -> None:
 
 def test_movements_without_a_count_are_named(read: Read) -> None:
     lines = ["approach,turn,count", "N,,10", "S,,10", "E,,10", "W,left,10", "W,right,10"]
-    assert "Movements without a count get no vehicles: East Street (west) straight." in read(*lines).notes
+    counts = read(*lines)
+    assert "Movements without a count get no vehicles: East Street (west) straight." in counts.notes
+    assert counts.assumptions[-1] == "no vehicles in uncounted movements: East Street (west) straight"
+    hours = read("approach,turn,start,count", "N,,07:00,9", "N,,08:00,9", "S,,07:00,9", "E,,07:00,9", "W,,07:00,9")
+    assert hours.assumptions[-1] == "no vehicles in uncounted movements: those of 08-09"
+    assert not any("uncounted" in text for text in read("approach,count", "N,9", "S,9", "E,9", "W,9").assumptions)
+
+
+def test_warns_of_counts_that_lanes_cannot_carry(read: Read) -> None:
+    def warnings(*lines: str) -> list[str]:
+        counts = read("approach,turn,count,kind", *lines)
+        return [text.partition("counts.csv: ")[2] for text in counts.warnings(Path("scenario.toml"))]
+
+    assert warnings("N,left,1900,", "S,left,1000,") == []
+    assert warnings("N,left,1900,", "N,left,1980,truck", "S,left,1000,") == [
+        "North Street (north) left: 3,880 vehicles an hour exceed what 1 lane can carry, at most 2,000."
+        " Check the count."
+    ]
+    assert warnings("N,left,1100,", "N,right,1100,") == [
+        "North Street (north): 2,200 vehicles an hour exceed what 1 lane can carry, at most 2,000. Check the count."
+    ]
 
 
 # --- the scenario ----------------------------------------------------------------------------------------------------
@@ -188,10 +212,16 @@ def test_scenario_has_the_counts_as_periods(tmp_path: Path, run_egvs: Any, monke
 
 
 def test_counts_of_one_hour_are_no_period(tmp_path: Path, run_egvs: Any) -> None:
-    (tmp_path / "c.csv").write_text("approach,turn,count\nN,left,40\n")
-    assert run_egvs("new", tmp_path / "new", "--osm", SMALL, "--counts", tmp_path / "c.csv")[0] == 0
-    traffic = loading.load(tmp_path / "new").traffic
-    assert (traffic.periods, [count.per_hour for count in traffic.counts]) == ((), [40.0])
+    (tmp_path / "c.csv").write_text("approach,turn,count\nN,left,3880\n")
+    code, printed, _ = run_egvs("new", tmp_path / "new", "--osm", SMALL, "--counts", tmp_path / "c.csv")
+    assert code == 0 and "North Street (north) left: 3,880 vehicles an hour exceed what" in " ".join(printed.split())
+    scenario = loading.load(tmp_path / "new")
+    traffic = scenario.traffic
+    assert (traffic.periods, [count.per_hour for count in traffic.counts]) == ((), [3880.0])
+    assert main_assumptions(scenario.assumed) == (
+        "Assumed, not measured: no vehicles in uncounted movements: North Street (north) right and others;"
+        " positions of the poles and 4 more."
+    )
     text = (tmp_path / "new" / "scenario.toml").read_text()
     assert "North Street (north), left to East Street" in text
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import base64
 import copy
 import importlib.util
@@ -16,6 +17,8 @@ from typing import Any
 
 import nbformat
 import pytest
+
+import egvs
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "docs" / "notebooks"
@@ -44,6 +47,15 @@ def read(name: str) -> nbformat.NotebookNode:
 
 def test_there_are_notebooks() -> None:
     assert "map-to-decision" in NAMES
+
+
+def test_paper_counts_every_beam() -> None:
+    """The paper's score has no losses of returns, which act here by default."""
+    source = next(cell.source for cell in read("paper").cells if "settings = [" in cell.source)
+    settings = ast.literal_eval(source.split("settings = ", 1)[1].splitlines()[0])
+    path = egvs.shipped_scenario("nishishinjuku")
+    assert [effect.NAME for effect in egvs.build_scene(egvs.load(path)).effects] == ["range_limit"]
+    assert egvs.build_scene(egvs.load(path, settings)).effects == ()
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -16,10 +16,12 @@ import egvs
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_tpog
+from egvs.core.errors import InputError
 from egvs.drawing import svg_figures
 from egvs.placement import problem_builder
+from egvs.placement.problem_builder import rules_from_config
 from egvs.scoring.egvs import EntropyField
-from egvs.sensors.sites import candidate_sites
+from egvs.sensors.sites import Pose, Site, candidate_sites
 
 SITES = """site,x_m,y_m,z_m,cost
 a,10,12,3,
@@ -49,6 +51,26 @@ def five_candidates(mini: Path) -> Path:
 def out(tmp_path: Path) -> Path:
     """The run's folder."""
     return tmp_path / "out"
+
+
+def test_forced_and_excluded_may_name_poles(mini: Path) -> None:
+    """People know their poles; the names of candidates have heights and tilts."""
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\nLaterne Süd,10,12,5\n")
+    scenario = egvs.load(mini, ["placement.forced=['Laterne Süd']"])
+    mounts = [
+        Site(f"{pole}@{z_m}m", Pose(x_m, 12.0, z_m), "small", pole=pole)
+        for pole, x_m, heights_m in (("Laterne Süd", 10.0, (5,)), ("Mast West", 20.0, (3, 5)))
+        for z_m in heights_m
+    ]
+    assert rules_from_config(scenario, mounts).forced == (0,)
+    excluded = rules_from_config(egvs.load(mini, ["placement.excluded=['Mast West']"]), mounts).excluded
+    assert excluded.tolist() == [False, True, True]
+    for name, message in (
+        ("Mast West", r"pole 'Mast West' has 2 candidates. Choose one of Mast West@3m, Mast West@5m\."),
+        ("Mast Ost", r"no candidate or pole 'Mast Ost'. Choose one of Mast West, Laterne Süd\."),
+    ):
+        with pytest.raises(InputError, match=message):
+            rules_from_config(egvs.load(mini, [f"placement.forced=['{name}']"]), mounts)
 
 
 def joint_egvs(five_candidates: Path, out: Path, *names: str) -> float:
@@ -260,7 +282,7 @@ REJECTED = {
     ),
     "no such candidate": (
         ["--count", "2", "--set", "placement.forced=['nobody']"],
-        "placement.forced: no candidate 'nobody'. Choose one of b, d, b_high, a, c.",
+        "placement.forced: no candidate or pole 'nobody'. Choose one of b, d, a, c.",
     ),
     "budget below the cheapest": (
         ["--budget", "50", "--set", "costs.pole=60"],
@@ -552,12 +574,13 @@ def test_rule_that_forbids_one_more_is_named(five_candidates: Path, out: Path, r
     assert run_egvs("run", five_candidates, "--out", out, *rules)[0] == 0
     code, text, error = run_egvs("place", five_candidates, "--out", out, "--count", 3, *rules)
     assert code == 0, error
-    assert "most_per_pole = 1 forbids a third sensor beside them." in text and "adds nothing" not in text
-    assert "most_per_pole = 1 forbids a third sensor beside them." in (out / "report.html").read_text()
+    sentence = "The limit of 1 sensor per pole (most_per_pole) forbids a third sensor beside them."
+    assert sentence in text and "adds nothing" not in text
+    assert sentence in (out / "report.html").read_text()
     plan = egvs.open_session(out).plan
     assert plan is not None and len(plan.sites) == 2
-    assert (plan.best_next, plan.forbids_more) == (None, "most_per_pole = 1")
+    assert (plan.best_next, plan.forbids_more) == (None, "the limit of 1 sensor per pole (most_per_pole)")
 
     apart = ("--set", "placement.least_distance_m=1000")
     _, text, _ = run_egvs("place", five_candidates, "--out", out / "apart", "--count", 3, *apart)
-    assert "least_distance_m = 1000 forbids a second sensor beside it." in text
+    assert "The distance of 1000 m (least_distance_m) forbids a second sensor beside it." in text

@@ -212,7 +212,7 @@ def test_says_which_losses_of_returns_are_simulated(plain_run, tmp_path):
     summary = {"sites": 4, "solids": 3, "lanes": 0, "losses": ["losses are simulated for small (17 m)"]}
     record["stages"]["check"] = record["stages"]["tpog"] | {"summary": summary}
     (tmp_path / "out" / "run.json").write_text(json.dumps(add_checksum(record)))
-    assert "Losses are simulated for small (17 m)." in render_report(scenario, tmp_path / "out")
+    assert "Losses are simulated for small (17\u00a0m)." in render_report(scenario, tmp_path / "out")
     assert "losses are simulated" not in text.lower()
 
 

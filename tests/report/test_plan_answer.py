@@ -14,7 +14,7 @@ from egvs.results.plans import PlannedSensor, PlanStep, SensorPlan
 
 FOUND = SCORE_LABELS["expected_detections"]
 EGVS = SCORE_LABELS["egvs"]
-NO_LIMIT: dict[str, Any] = {"budget": None, "reach": None, "objective": "joint", "survives": 0}
+NO_limit: dict[str, Any] = {"budget": None, "reach": None, "objective": "joint", "survives": 0}
 
 
 def steps_of(*scores: float, gain_se: float = math.nan, beats: float = math.nan) -> list[PlanStep]:
@@ -38,7 +38,7 @@ def sensor(site: str, score: float, score_se: float = math.nan) -> PlannedSensor
 
 def plan_of(steps: list[PlanStep], sensors: int, candidates: int, **request: float) -> SensorPlan:
     return SensorPlan(
-        (sensor("a", 0.9),) * sensors, tuple(steps), "expected_detections", NO_LIMIT | request, joint=0.9,
+        (sensor("a", 0.9),) * sensors, tuple(steps), "expected_detections", NO_limit | request, joint=0.9,
         joint_of_all=1.0, cost=0.0, candidates=candidates, zones=(), is_best=True, fewest_is_proved=None,
     )  # fmt: skip
 
@@ -144,15 +144,16 @@ def test_sensor_that_meets_requirements_is_useful() -> None:
 
 def test_names_the_rule_that_forbids_one_more() -> None:
     three = with_sites(steps_of(0.80, 0.90, 0.90), "a", "ab", "ab")
-    rule = "most_per_pole = 1 forbids a third sensor beside them."
-    assert describe_count(three, FOUND, forbids_more="most_per_pole = 1") == (
+    limit = "the limit of 1 sensor per pole (most_per_pole)"
+    rule = "The limit of 1 sensor per pole (most_per_pole) forbids a third sensor beside them."
+    assert describe_count(three, FOUND, forbids_more=limit) == (
         "A second sensor adds 10.0 percentage points to the share of vehicles found: 90.0 %, against 80.0 % with one. "
         + rule
     )
-    assert describe_count(three[:1], FOUND, forbids_more="a and b") == "a and b forbid a second sensor beside it."
-    worst = describe_count(three, FOUND, objective="the worst period", forbids_more="most_per_pole = 1")
+    assert describe_count(three[:1], FOUND, forbids_more="a and b") == "A and b forbid a second sensor beside it."
+    worst = describe_count(three, FOUND, objective="the worst period", forbids_more=limit)
     assert worst.endswith(f"the plan maximises the worst period. {rule}")
-    plan = replace(plan_of(three[:2], sensors=2, candidates=4), forbids_more="most_per_pole = 1")
+    plan = replace(plan_of(three[:2], sensors=2, candidates=4), forbids_more=limit)
     assert next_count(plan) is None
 
 

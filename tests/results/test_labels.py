@@ -48,7 +48,7 @@ def test_small_standard_error_is_not_written_as_zero() -> None:
     egvs, detections = SCORE_LABELS["egvs"], SCORE_LABELS["expected_detections"]
     assert detections.with_error(0.999, 0.0004) == "99.9 ± <0.1 %"
     assert egvs.change(55.0, 0.4) == "55 ± <1"
-    assert detections.with_error(1.0, 0.0) == "100.0 ± 0.0 %"
+    assert detections.with_error(1.0, 0.0) == "100.0 %"
     assert detections.is_zero(0.0004)
     assert not detections.is_zero(0.0006)
 

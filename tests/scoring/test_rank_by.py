@@ -294,6 +294,7 @@ from egvs.scoring.target_scores import VehicleScore
 MY_SCORE = VehicleScore("my_score", "n / (n + 5)", "an example", lambda seen: seen.points / (seen.points + 5.0))
 WRONG = VehicleScore("wrong", "", "", lambda seen: seen.points + 2.0)
 OF_SITES = "a score of sites"
+RAISING = VehicleScore("raising", "", "", lambda seen: 1 / 0)
 """
 PERIODS = 'traffic.periods=[{name="a", length_s=12}, {name="b", begin_s=12, length_s=8}]'
 
@@ -302,12 +303,36 @@ PERIODS = 'traffic.periods=[{name="a", length_s=12}, {name="b", begin_s=12, leng
 def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A package of somebody else with scores."""
     entries = "my_score = plug_score:MY_SCORE\nwrong = plug_score:WRONG\nof_sites = plug_score:OF_SITES"
+    entries += "\nraising = plug_score:RAISING\nbroken = plug_score:NOTHING"
     install(tmp_path / "site", "somebody-elses", entries, {"plug_score": VEHICLE_SCORE}, SCORES_GROUP)
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
     clear_caches()
     yield
     clear_caches()
     sys.modules.pop("plug_score", None)
+
+
+def test_broken_score_is_reported_first(mini: Path, tmp_path: Path, plugin: None, run_egvs) -> None:
+    code, _, error = run_egvs("run", mini, "--out", tmp_path / "out", "--set", "score.rank_by=broken")
+    assert code == 1 and "'broken' of egvs.scores cannot be loaded" in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_misspelt_score_names_the_meant_one(mini: Path, plugin: None) -> None:
+    with pytest.raises(InputError, match=r"got 'my_scroe'; did you mean 'my_score'\?"):
+        loading.load(mini, ["score.rank_by=my_scroe"])
+
+
+def test_raising_score_is_one_message(mini: Path, tmp_path: Path, plugin: None, run_egvs) -> None:
+    code, _, error = run_egvs("run", mini, "--out", tmp_path / "out", "--set", "score.rank_by=raising")
+    assert code == 1 and "Traceback" not in error
+    assert "score raising: its function raised ZeroDivisionError('division by zero')" in error
+
+
+def test_list_of_scores_ends_with_those_that_rank(plugin: None, run_egvs) -> None:
+    code, printed, _ = run_egvs("scores")
+    last = printed[printed.index("[score] rank_by chooses") :]
+    assert code == 0 and "my_score" in last and "broken" not in last and "of_sites" not in last
 
 
 @pytest.mark.parametrize("periods", [(), (PERIODS,)], ids=["no periods", "periods"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 import shapely
 
 import egvs
-from egvs.artefacts import readers, traffic_frames
+from egvs.artefacts import frame_boxes, readers, traffic_frames
 from egvs.artefacts.readers import ZoneVisibility
 from egvs.core.errors import InputError
 from egvs.formats import georeference
@@ -31,7 +32,7 @@ from egvs.world.carriageway import Carriageway
 from tests.conftest import collection, feature
 from tests.scoring.target_scenes import GRID, frame
 
-PEOPLE = traffic_frames.NON_VEHICLE_KINDS
+PEOPLE = frame_boxes.NON_VEHICLE_KINDS
 
 
 def square(west: float, south: float, east: float, north: float) -> dict[str, Any]:
@@ -107,6 +108,9 @@ def test_sidewalk_zones_without_pedestrians_give_no_warning() -> None:
         " ([effects.pedestrians_bicycles]): north sidewalk"
     )
     assert users(TargetRecord.of([cars], GRID, PEOPLE), None).for_pedestrians == ()
+    recorded = replace(without_people, is_recorded=True)
+    assert "no pedestrians were recorded" in recorded.describe_for_pedestrians()
+    assert "[effects" not in str(next(recorded.warn_empty()))
 
 
 def test_sensors_together_miss_what_both_miss(monkeypatch: pytest.MonkeyPatch) -> None:

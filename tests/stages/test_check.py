@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import egvs
+from egvs.cli.run_tables import print_check
 from egvs.core.errors import DiagnosticsError, InputError
 from egvs.report.sections import describe_poles_on_road
 from egvs.sensors.sites import Pose, Site
@@ -173,7 +174,8 @@ def mast(at_m: tuple[float, float], name: str, kind: str = "mast") -> dict:
     return feature({"type": "Point", "coordinates": at_m}, name=name, kind=kind, height_m=4, radius_m=0.1)
 
 
-def test_lists_masts_that_carry_sensors(street: Path) -> None:
+def test_masts_that_carry_sensors_are_a_note(street: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """They are there on purpose, and need no attention."""
     statics(street, mast((10, 6), "m1"), mast((20.3, 6), "m2", "pole"), mast((30, 8), "m3"))
     (street / "sites.csv").write_text("site,x_m,y_m\na,10,6\nb,20,6\nc,30,6\n")
     assert found(street, "sites.heights_m=[3, 4, 5]") == {
@@ -181,6 +183,11 @@ def test_lists_masts_that_carry_sensors(street: Path) -> None:
             "[statics: 2 solids carry sensors and are left out of their scans: m1 (mast) at a, m2 (pole) at b]"
         ]
     }
+    checked = check.check_scenario(egvs.load(street, ["sites.heights_m=[3, 4, 5]"]))
+    assert (checked.warnings, [note.rule for note in checked.notes]) == ((), ["own supports"])
+    print_check(checked)
+    printed = capsys.readouterr().out
+    assert "\n1 note\n" in printed and "no errors or warnings" in printed
 
 
 def test_candidate_of_a_rule_may_be_on_a_pole_but_not_in_a_house(street: Path) -> None:
@@ -257,7 +264,7 @@ def test_rejects_rule_without_feasible_candidate(street: Path) -> None:
 def test_rejects_visibility_of_dropped_site(street: Path) -> None:
     rule(street, "{ low_m=[6,-6], high_m=[6,-1], spacing_m=5, heights_m=[3.0] }")
     told = found(street, 'score.keep_visibility=["g02"]')
-    assert told == {"sites": ["scenario.toml: score.keep_visibility: the site 'g02' is dropped: it stands in a lane"]}
+    assert told == {"sites": ["command line: score.keep_visibility: the site 'g02' is dropped: it stands in a lane"]}
 
 
 def test_warns_of_beams_that_miss_region(street: Path) -> None:
@@ -536,8 +543,8 @@ def test_reports_missing_files_and_unknown_formats(street: Path) -> None:
     (street / "scan.xyz").write_text("")
     told = found(street, 'statics.polygons=["gone.poly.xml"]', 'sensors.own={beams="beams.csv",range_m=50}')
     assert {line.partition(": no such")[0] for line in told["files"][:3]} == {
-        "scenario.toml: statics.polygons = 'gone.poly.xml'",
-        "scenario.toml: sensors.own.beams = 'beams.csv'",
+        "command line: statics.polygons = 'gone.poly.xml'",
+        "command line: sensors.own.beams = 'beams.csv'",
         "scenario.toml: site a: points = 'gone.pcd'",
     }
     assert "scan.xyz" in told["files"][3]

@@ -29,6 +29,8 @@ def test_two_vehicles_per_frame_are_enough(mini: Path, tmp_path: Path) -> None:
     assert warnings(mini, tmp_path / "out") == {}
     (one,) = occupancy.warn_empty_region(1.0, tmp_path / "is not read")
     assert one.problem.startswith("1 vehicle is in the region on average")
+    (people,) = occupancy.warn_empty_region(1.2, tmp_path / "is not read", people=True)
+    assert people.problem.startswith("1.2 road users are in the region on average")
     few = warnings(mini, tmp_path / "few", "roi.center_m=[30,0,2.5]", "roi.size_m=[20,20,5]")
     assert len(few["tpog"]) == 1
     assert few["tpog"][0].endswith(

@@ -28,7 +28,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from benchmarks.across_junctions.models import crowding_kernels
-from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS
 from egvs.core.grid import FloatArray, IntArray
 from egvs.kernels import vehicle_visibility
 from egvs.scoring.targets import TargetRecord, VisibleTargets

@@ -14,6 +14,9 @@ from egvs.artefacts import parquet
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
 
+NON_VEHICLE_KINDS = frozenset({"pedestrian", "bicycle", "scooter", "wheelchair"})
+"""SUMO vClasses that are not vehicles, and not expected to be detected as such."""
+
 PITCHED_BOX_COLUMNS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
 
 UNKNOWN_BOXES_KEY = "unknown_boxes"

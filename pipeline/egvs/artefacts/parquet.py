@@ -187,6 +187,8 @@ def read_artefact(path: Path, artefact: str, columns: list[str] | None = None) -
 @contextmanager
 def open_artefact(path: Path, artefact: str) -> Iterator[OpenArtefact]:
     """Open an artefact to read its row groups one by one; InputError as of :func:`read_artefact`."""
+    if path.is_dir():
+        raise InputError(path, f"expected the file {artefact}.parquet, got a folder", f"Use {path / artefact}.parquet.")
     if not path.is_file():
         raise InputError(path, "no such file", f"Run the stage that writes {path.name} first.")
     shared = _SHARED_FILES.get()

@@ -379,6 +379,9 @@ def read_visibility(path: str | Path, site: str) -> FloatArray:
     import pyarrow.compute as pc  # a slow import, which only this function needs
 
     path = Path(path)
+    if not path.exists():
+        hint = f'Run with score.keep_visibility = ["{site}"], or "all": only then it is written.'
+        raise InputError(path, "no such file", hint)
     table, metadata = parquet.read_artefact(path, "visibility")
     rows = table.filter(pc.equal(table.column("site"), site))
     if len(rows) == 0 and site not in {entry["site"] for entry in metadata["sites"]}:

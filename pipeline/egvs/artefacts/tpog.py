@@ -178,7 +178,10 @@ def read_tpog(path: str | Path, period: str | None = None) -> Tpog:
         if period is not None:
             names = [record.name for record in periods]
             if period not in names:
-                raise InputError(path, f"there is no period {period!r}", f"The periods are {', '.join(names)}.")
+                hint = (
+                    f"The periods are {', '.join(names)}." if any(names) else "Its traffic has no periods: name none."
+                )
+                raise InputError(path, f"there is no period {period!r}", hint)
             frames = periods[names.index(period)].frames
 
         times = block_multiplicities(periods, period)

@@ -16,7 +16,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.artefacts.frame_boxes import check_frame_order
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS, check_frame_order
 from egvs.core.grid import Roi
 
 
@@ -27,9 +27,6 @@ def read_trajectories(path: str | Path) -> pa.Table:
 
 BOX_COLUMNS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
 """Columns of a box of ground truth or of a detection: centre in the world frame, size, heading."""
-
-NON_VEHICLE_KINDS = frozenset({"pedestrian", "bicycle", "scooter", "wheelchair"})
-"""SUMO vClasses that are not vehicles, and not expected to be detected as such."""
 
 
 @dataclass(frozen=True)

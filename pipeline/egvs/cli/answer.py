@@ -6,6 +6,7 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,9 @@ MIN_POLES, DEFAULT_POLES = 3, 5
 
 _MAX_SIGNALS = 2
 """Further signals are left to the report."""
+
+_TILT_STEP_DEG = 6.0
+"""The best tilt is not searched between tilts that are nearer to one another."""
 
 _MAX_PERIODS = 4
 """With more periods, their ranks are left to ``--all`` and the report."""
@@ -106,11 +110,15 @@ def _print_short(
     after = []
     if record.stages["score"].summary.get("missed") and (worst := _worst_location(folder, best)):
         after += wrap_lines(f"Worst lane: {worst}.", 1)
-    if on_road := sections.describe_poles_on_road(ranked.poles[:MIN_POLES], _check_warnings(record)):
+    if missing := sections.describe_missing_traffic(_warnings(record)):
+        after += wrap_lines(missing, 1)
+    if on_road := sections.describe_poles_on_road(ranked.poles[:MIN_POLES], _warnings(record)):
         after += wrap_lines(f"Careful: {join_names(on_road)}.", 1)
     plans = record.traffic_summary.get("signals", ())
     if assumed := sections.main_assumptions(sections.assumptions(scenario, plans)):
         after += wrap_lines(assumed, 1)
+    if (hint := _finer_tilts(folder, ranked)) and max_lines - len(before) - len(after) - 2 > MIN_POLES:
+        after.append(hint)
     after.append(f"report: {folder.report} (has everything; --verbose prints it)")
     room = max_lines - len(before) - len(after) - 1
     count = poles or min(DEFAULT_POLES, max(MIN_POLES, room))
@@ -120,6 +128,23 @@ def _print_short(
     out.print(_short_table(ranked, PeriodRanking.read(folder.path), count, has_relief))
     for line in after:
         out.print(line, soft_wrap=True)  # a path that is broken into lines cannot be copied
+
+
+def _finer_tilts(folder: RunFolder, ranked: Ranking) -> str:
+    """Return the command that searches tilts, where the best one may lie beside those that were tried; else empty.
+
+    That is where the best site has the steepest or the flattest tilt on its pole, or where the next one is further away
+    than :data:`_TILT_STEP_DEG`.
+    """
+    best = ranked.best[0]
+    on_pole = next(pole for pole in ranked.poles if pole.name == best.pole).sites
+    others = [site.pitch_deg - best.pitch_deg for site in on_pole if site.sensor == best.sensor]
+    steeper, flatter = [-step for step in others if step < 0], [step for step in others if step > 0]
+    if not (steeper or flatter) or find_spec("egvs.extensions.hardware") is None:
+        return ""
+    if steeper and flatter and max(min(steeper), min(flatter)) <= _TILT_STEP_DEG:
+        return ""
+    return f"Finer tilts: {shlex.join(['egvs', 'sensor', 'design', str(folder.path), '--pole', best.pole])}"
 
 
 def _worst_location(folder: RunFolder, best: RankedSite) -> str:
@@ -139,7 +164,9 @@ def _print_details(
     traffic_summary = record.traffic_summary
     plans = traffic_summary.get("signals", ())
     sentences = signal_sentences(plans)
-    on_road = sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record))
+    on_road = sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _warnings(record))
+    if missing := sections.describe_missing_traffic(_warnings(record)):
+        sentences.append(missing)
     if caveats := sections.describe_caveats(scenario, "ranking", on_road, plans):
         sentences.append(caveats)
     sentences += reliability.describe_reliability(ranked, traffic_summary, scenario.score.ranking_detectors)
@@ -167,10 +194,8 @@ def signal_sentences(plans: Sequence[Mapping[str, Any]]) -> list[str]:
     return sentences
 
 
-def _check_warnings(record: RunRecord) -> list[Diagnostic]:
-    if "check" not in record.stages:
-        return []
-    return collect_warnings([record.stages["check"].summary])
+def _warnings(record: RunRecord) -> list[Diagnostic]:
+    return collect_warnings(stage.summary for stage in record.stages.values())
 
 
 def flow_source(scenario: Scenario) -> str:
@@ -300,7 +325,7 @@ def _mount_columns(sites: Sequence[RankedSite], poles: Sequence[Pole]) -> list[C
         columns.append(Column("sensor", lambda pole: pole.best.sensor, "left"))
     columns.append(Column("z m", lambda pole: f"{pole.best.z_m:.4g}"))
     if any(site.yaw_deg or site.pitch_deg for site in sites):
-        columns.append(Column("yaw deg", lambda pole: f"{pole.best.yaw_deg:.0f}"))
+        columns.append(Column("ccw yaw deg", lambda pole: f"{pole.best.yaw_deg:.0f}"))
         columns.append(Column("pitch deg", lambda pole: f"{pole.best.pitch_deg:z.0f}"))
     return columns
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,17 +13,27 @@ import typer
 
 from egvs.cli import options, sources
 from egvs.cli.options import Detector, Jobs, Out, Set, SettingsPath
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, collect_warnings
 from egvs.core.wording import by_number, format_percent, number_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.table import Table
 
     from egvs.results.labels import ScoreLabel
+    from egvs.results.levels import DetectionLevel, GroupLevel
     from egvs.results.plans import FusedPlan, PlannedSensor, PlanStep, RefinementSummary, SensorPlan
+    from egvs.scenario.model import Scenario
 
 _NARROW_HEAD_WIDTH = 10
 """Characters of a line of the head of a column on a narrow terminal."""
+
+_EXPORTS = (
+    "export/*/plan*", "export/*/scene.*", "export/*/extrinsics.json", "export/*.gpkg",
+    "export/*.kml", "export/*.dxf",
+)  # fmt: skip
+"""Exports of a run that show its plan."""
 
 _REQUEST_KEYS = ("count", "budget", "reach")
 """Keys of ``[placement]`` that are options of ``egvs place`` too."""
@@ -72,9 +83,10 @@ def place(
         from egvs.cli import answer
         from egvs.placement import plan
         from egvs.report import sections, sensor_text
+        from egvs.sensors import sites
 
         screen.flow_source = answer.flow_source(loaded)
-        replaced = plan.planned_request(folder)
+        replaced, earlier = plan.planned_request(folder), plan.planned_mounts(folder)
         placed = plan.place(
             loaded, folder, exact=exact, time_limit_s=limit_s, refine=refine, jobs=jobs, progress=screen.progress,
             listener=screen.stage_event,
@@ -84,11 +96,31 @@ def place(
         notes.append(describe_replaced(replaced, request_now or {}))
     if exact and not (placed.is_best or placed.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
-    plans = RunRecord.read(folder).traffic_summary.get("signals", ())
-    caveats = [sections.main_assumptions(sections.assumptions(loaded, plans))]
+    if replaced is not None and (outdated := outdated_handovers(folder, earlier, placed)):
+        notes.append(outdated)
+    traffic = RunRecord.read(folder).traffic_summary
+    assumed = sections.assumptions(loaded, traffic.get("signals", ()))
+    caveats = [sections.describe_missing_traffic(collect_warnings([traffic])), sections.main_assumptions(assumed)]
     if placed.fused is not None and placed.fused.noticed is not None:
         caveats.append(sensor_text.upper_limit_note(loaded, [sensor.sensor for sensor in placed.sensors]))
-    print_placement(placed, notes, [caveat for caveat in caveats if caveat])
+    found, has_relief = _plan_level(loaded, folder, placed), sites.has_relief(loaded)
+    print_placement(placed, notes, [caveat for caveat in caveats if caveat], found, has_relief=has_relief)
+
+
+def _plan_level(scenario: Scenario, folder: Path, placed: SensorPlan) -> DetectionLevel:
+    """Return what is known of the share that detectors find from the sensors of a plan."""
+    from egvs.artefacts.run_folder import RunFolder
+    from egvs.report import sensor_text
+    from egvs.results.levels import NO_DETECTORS, read_levels
+    from egvs.results.ranking import Ranking
+
+    run_folder = RunFolder(folder)
+    if not placed.sensors:
+        return NO_DETECTORS
+    groups: Sequence[GroupLevel] = ()
+    if run_folder.levels.is_file() and run_folder.scores.is_file():
+        groups = read_levels(run_folder.levels, Ranking.read(run_folder.scores).sites[0].site)
+    return sensor_text.plan_level(scenario, [sensor.sensor for sensor in placed.sensors], groups)
 
 
 def _check_request(count: int | None, reach: float | None) -> None:
@@ -102,7 +134,14 @@ def _check_request(count: int | None, reach: float | None) -> None:
         raise InputError("--reach", f"expected a share above 0, at most 1, got {reach:g}", hint)
 
 
-def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveats: Sequence[str] = ()) -> None:
+def print_placement(
+    placed: SensorPlan,
+    notes: Sequence[str] = (),
+    caveats: Sequence[str] = (),
+    found: DetectionLevel | None = None,
+    *,
+    has_relief: bool = False,
+) -> None:
     """Print the plan and the curve, what a planner should know, and the files.
 
     Parameters
@@ -113,12 +152,16 @@ def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveats: Sequ
         Sentences about the search.
     caveats
         The last sentences, on what was assumed.
+    found
+        As for :func:`egvs.report.plan_answer.describe_share`; by default without detectors.
+    has_relief
+        Whether the ground is elsewhere than at z = 0.
     """
     from egvs.artefacts.readers import describe_worst_zones, worst_zones
     from egvs.cli.console import WIDE, console, print_sentences
 
     out = console(WIDE, soft_wrap=False)
-    print_sentences([describe_plan(placed)])
+    print_sentences([describe_plan(placed, found, has_relief=has_relief)])
     out.print(_sensor_table(placed, out.width))
     if any(sensor.forced for sensor in placed.sensors):
         out.print("* already installed")
@@ -140,11 +183,11 @@ def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveats: Sequ
 
 
 def _other_plans(placed: SensorPlan) -> list[PlanStep]:
-    """Return the best plans of fewer sensors that are not the first sensors of the plan, which its table has."""
-    if placed.refinement is not None:
-        return list(placed.curve)
+    """Return the best plans of each number of sensors; none if they are the first sensors of the plan in its table."""
     sites = [sensor.site for sensor in placed.sensors]
-    return [step for step in placed.curve if set(step.sites) != set(sites[: len(step.sites)])]
+    if placed.refinement is None and all(set(step.sites) == set(sites[: len(step.sites)]) for step in placed.curve):
+        return []
+    return list(placed.curve)
 
 
 def _further_sentences(placed: SensorPlan) -> Iterator[str]:
@@ -175,15 +218,11 @@ def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
     by
         Label of the joint score.
     """
-    from egvs.results.labels import join_names
-
     noticed = f"People would notice {fused.noticed.text} of vehicles" if fused.noticed is not None else ""
     if len(fused.steps) == 1:
         return f"{noticed} in the sweeps of this sensor." if noticed else ""
-    counts = join_names([str(step.count) for step in fused.steps])
-    values = join_names([by.with_unit(step.score, step.score_se) for step in fused.steps])
     last = f"{by.change(fused.steps[-1].gain, fused.steps[-1].gain_se)} {by.change_unit}"
-    text = f"In fused clouds, the first {counts} sensors find {values}; the last one adds {last}"
+    text = f"In fused clouds, the last sensor adds {last}"
     if noticed:
         noticed = f" {noticed} there."
     if fused.better is not None:
@@ -204,9 +243,11 @@ def _sensor_table(placed: SensorPlan, width: int) -> Table:
         rolls.append(Column("roll", lambda row: describe_roll(row.roll_deg), "left", wrap=True))
     columns: list[Column[PlannedSensor]] = [
         Column("", lambda row: row.marked_order),
-        Column("site", lambda row: row.site, "left", wrap=True),
-        Column("z m", lambda row: f"{row.z_m:g}"),
-        Column(head("yaw deg"), lambda row: f"{row.yaw_deg:.1f}"),
+        Column("site", lambda row: row.site, "left", wrap=True)
+        if placed.refinement is None
+        else Column("pole", lambda row: row.pole, "left", wrap=True),  # names of sites have heights and tilts
+        Column("z m", lambda row: f"{row.z_m:.4g}"),
+        Column(head("ccw yaw deg"), lambda row: f"{row.yaw_deg:.1f}"),
         Column(head("pitch deg"), lambda row: f"{row.pitch_deg:z.1f}"),
         Column("sensor", lambda row: row.sensor, "left"),
         *rolls,
@@ -270,17 +311,62 @@ def describe_replaced(replaced: Mapping[str, Any], requested: Mapping[str, Any])
     """
     options = [f"--{key} {replaced[key]:.15g}" for key in _REQUEST_KEYS if replaced.get(key) is not None]
     is_other_option = any(replaced.get(key) != requested.get(key) for key in _REQUEST_KEYS)
-    settings = "" if is_other_option else " with other settings in [placement]"
+    others = {key for key in replaced.keys() | requested.keys() if replaced.get(key) != requested.get(key)}
+    settings = " with other settings in [placement]"
+    if is_other_option:
+        settings = ""
+    elif others == {"refine"}:
+        settings = " without --refine" if replaced.get("refine") is None else " with --refine"
+        if replaced.get("refine") and requested.get("refine"):
+            settings = " with other settings in [placement.refine]"
     return f"replaces the plan for {' '.join(options)}{settings}"
 
 
-def describe_plan(placed: SensorPlan) -> str:
-    """Return the plan, its joint score with its standard error, and its certificate, in one sentence."""
-    by, last = placed.by, placed.curve[-1]
-    sites = ", ".join(sensor.site for sensor in placed.sensors) or "no sensor"
-    cost = f" for {last.cost:g}" if last.cost else ""
-    score = by.says.format(by.with_unit(last.score, last.score_se))
-    return f"The plan {sites}{cost} {score}; {_describe_proof(placed)}."
+def describe_plan(placed: SensorPlan, found: DetectionLevel | None = None, *, has_relief: bool = False) -> str:
+    """Return the plan, what it achieves, and its certificate, in one sentence; see :func:`print_placement`."""
+    from egvs.report.plan_answer import describe_share
+    from egvs.results.levels import NO_DETECTORS
+    from egvs.results.ranking import site_titles
+
+    sites, separator = [sensor.site for sensor in placed.sensors], ", "
+    proof = _describe_proof(placed)
+    if placed.refinement is not None:  # the names of the candidates may have their heights and tilts
+        titles = site_titles(placed.sensors, has_relief=has_relief, is_moved=True)
+        sites, separator = [titles[site] for site in sites], "; "
+        proof += ", at the poses of the candidates"
+    cost = f" for {placed.cost:g}" if placed.cost else ""
+    names = separator.join(sites) or "no sensor"
+    return f"The plan {names}{cost} {describe_share(placed, found or NO_DETECTORS)}; {proof}."
+
+
+def outdated_handovers(folder: Path, earlier: Sequence[tuple[Any, ...]], placed: SensorPlan) -> str:
+    """Return which files for other people show the earlier plan, in one sentence; empty where the plans are the same.
+
+    Parameters
+    ----------
+    folder
+        The run folder.
+    earlier
+        The sensors of the earlier plan (:func:`egvs.placement.plan.planned_mounts`).
+    placed
+        The plan that replaced it.
+    """
+    from egvs.core.wording import by_number, list_first
+    from egvs.export.export import safe_file_name
+    from egvs.placement.plan import mount_of
+
+    if sorted(earlier) == sorted(map(mount_of, placed.sensors)):
+        return ""
+    patterns = [f"sheets/installation_{glob.escape(safe_file_name(site))}.*" for site, *_ in earlier]
+    names = []
+    for pattern in (*patterns, *_EXPORTS):
+        names += sorted(path.relative_to(folder).as_posix() for path in folder.glob(pattern) if path.is_file())
+    if not names:
+        return ""
+    verbs = [verb for verb, start in (("egvs sheets", "sheets/"), ("egvs export", "export/"))
+             if any(name.startswith(start) for name in names)]  # fmt: skip
+    shows = by_number(len(names), "shows", "show")
+    return f"{list_first(names, 3)} {shows} the earlier plan; repeat {' and '.join(verbs)}."
 
 
 def describe_errors(placed: SensorPlan) -> str:
@@ -290,7 +376,7 @@ def describe_errors(placed: SensorPlan) -> str:
     if placed.has_errors:
         text = f"± is one standard error, from {placed.errors_from}"
         if placed.by.name == DEFAULT_SCORE:
-            text += ", without the error of the level"
+            text += ", without the level error"
         return text
     return f"no standard errors: {placed.errors_from}"
 
@@ -303,7 +389,7 @@ def describe_absent_best(placed: SensorPlan) -> str | None:
     (best,) = first.sites
     if best in {sensor.site for sensor in placed.sensors}:
         return None
-    return f"The best single site, {best}, is not part of this plan: its sites complement one another better."
+    return f"The best single site, {best}, is not part of this plan."
 
 
 def _describe_proof(placed: SensorPlan) -> str:
@@ -332,7 +418,7 @@ def describe_refinement(placed: SensorPlan, summary: RefinementSummary) -> str:
         f"Refined: {by.noun} {by.value(summary.joint_before)} before, {by.with_unit(placed.joint, placed.joint_se)} "
         f"after{objective}{cost}; "
         f"{summary.poses_tried} poses tried in {summary.turns} rounds and {summary.seconds:.1f} s, "
-        f"{summary.poses_infeasible} of them infeasible; the proof applies to the candidates at their original poses."
+        f"{summary.poses_infeasible} of them infeasible."
     )
 
 

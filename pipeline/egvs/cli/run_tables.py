@@ -259,7 +259,7 @@ def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
         Column("pole", lambda pole: pole.name, "left", wrap=True),
         Column("best candidate", lambda pole: pole.best.site, "left", wrap=True),
         Column("z m", lambda pole: f"{pole.best.z_m:g}"),
-        Column("yaw deg", lambda pole: f"{pole.best.yaw_deg:.1f}"),
+        Column("ccw yaw deg", lambda pole: f"{pole.best.yaw_deg:.1f}"),
         Column("pitch deg", lambda pole: f"{pole.best.pitch_deg:z.1f}"),
         Column(by.head, lambda pole: _format_score(by, pole.best)),
         Column("candidates", lambda pole: str(len(pole.sites))),
@@ -322,7 +322,7 @@ def print_check(checked: CheckReport, *, with_details: bool = False) -> None:
         if hidden := len(checked.poles) - len(shown):
             out.print(f"{hidden} more poles; --verbose lists them")
         out.print("kerb: distance to the edge of the carriageway; wall: to the nearest building or other surface")
-    for severity, findings in (("error", checked.errors), ("warning", checked.warnings)):
+    for severity, findings in (("error", checked.errors), ("warning", checked.warnings), ("note", checked.notes)):
         if not findings:
             continue
         plural = "s" if len(findings) > 1 else ""
@@ -332,7 +332,7 @@ def print_check(checked: CheckReport, *, with_details: bool = False) -> None:
             for finding in findings:
                 if finding.rule == rule:
                     out.print(f"    {finding}")
-    if not checked.findings:
+    if not (checked.errors or checked.warnings):
         out.print("no errors or warnings")
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
 

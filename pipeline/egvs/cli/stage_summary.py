@@ -110,7 +110,7 @@ def _detail(text: str) -> Sentence:
 def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
     sites, solids, lanes = rest.pop("sites"), summary["solids"], rest.pop("lanes")
     yield Sentence(f"{number_of(sites, 'site')}, {number_of(solids, 'solid')} and {number_of(lanes, 'lane')} checked")
-    for note in rest.pop("losses", ()):
+    for note in (*rest.pop("losses", ()), *rest.pop("notes", ())):
         yield _detail(note)
 
 
@@ -201,7 +201,8 @@ _TRACK_COUNTS = {
 
 
 def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
-    yield Sentence(f"{rest.pop('boxes_in_roi'):.1f} vehicles in the region on average")
+    users = "road users" if rest.pop("with_people", False) else "vehicles"
+    yield Sentence(f"{rest.pop('boxes_in_roi'):.1f} {users} in the region on average")
     yield _detail(f"{number_of(rest.pop('occupied_voxels'), 'voxel')} occupied at least once")
     yield _detail(f"{rest.pop('static_voxels'):,} filled by static solids")
     memory = rest.pop("memory_frames")

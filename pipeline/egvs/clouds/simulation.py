@@ -61,7 +61,7 @@ from numpy.typing import NDArray
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.sweeps import LabelledSweep, SiteView, Sweep
 from egvs.core import files, plugins
-from egvs.core.errors import InputError, MissingBackendError
+from egvs.core.errors import InputError, MissingBackendError, check_list
 from egvs.core.grid import FloatArray, IntArray
 from egvs.effects.base import Echo, Echoes, checked_shares
 from egvs.effects.merge import Cones, Merge
@@ -689,7 +689,7 @@ def write_clouds(
     sites: Sequence[str] = (),
     frames: int,
     spacing_s: float | None = None,
-    kind: str = "kitti",
+    format: str = "kitti",
     jobs: int | None = None,
 ) -> Path:
     """Write labelled point clouds of a scenario's sites, as ``egvs clouds`` does, and return their folder.
@@ -706,8 +706,8 @@ def write_clouds(
         Number of frames of each site.
     spacing_s
         Minimum time between two frames, in seconds; by default 7 s, or what the traffic allows.
-    kind
-        Format: ``"kitti"``, ``"openpcdet"``, ``"ply"`` or ``"pcd"``.
+    format
+        ``"kitti"``, ``"openpcdet"``, ``"ply"`` or ``"pcd"``.
     jobs
         Number of threads; one per core when None. The files do not depend on it.
 
@@ -724,9 +724,12 @@ def write_clouds(
     'clouds'
     """
     check_is_scenario(scenario)
+    check_list("sites", sites)
+    if frames < 1:
+        raise InputError("frames", f"expected at least 1, got {frames}", "Use, for example, frames=100.")
     names = plugins.plugin_names(WRITERS_GROUP)
     if not names:
         raise MissingBackendError("write_clouds needs the extension validation, which is not installed.")
     write = plugins.load_plugin(WRITERS_GROUP, names[0])
-    write(scenario, Path(folder), sites=sites, frames=frames, spacing_s=spacing_s, kind=kind, jobs=jobs)
+    write(scenario, Path(folder), sites=sites, frames=frames, spacing_s=spacing_s, kind=format, jobs=jobs)
     return Path(folder)

@@ -73,11 +73,10 @@ class InputError(EgvsError):
         return InputError, (self.where, self.problem, self.hint)  # for another process
 
 
-def check_instance(name: str, value: object, kind: type, source: str) -> None:
-    """Raise an InputError if an argument is not of a class; ``source`` is the expression that makes one."""
-    if not isinstance(value, kind):
-        got = f"{type(value).__name__} {value!r}"
-        raise InputError(name, f"expected a {kind.__name__}, got {truncate_text(got)}", f"Use {source}.")
+def check_list(name: str, value: object) -> None:
+    """Raise an InputError if an argument that lists texts is one text, whose letters would be taken one by one."""
+    if isinstance(value, str):
+        raise InputError(name, f"expected a list of texts, got {value!r}", f"Write brackets: {name}=[{value!r}].")
 
 
 class RunError(EgvsError):

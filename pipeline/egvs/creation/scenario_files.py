@@ -42,8 +42,11 @@ STATICS_FILE, SITES_FILE, TERRAIN_FILE = "statics.geojson", "sites.csv", "terrai
 ZONES_FILE, COUNTS_FILE, SIGNALS_FILE = "zones.geojson", "counts.csv", "signals.csv"
 SENSOR = "VLP-32C"
 
-PITCHES_DEG: tuple[float | str, ...] = (0.0, -10.0, "aim")
-"""Tilts to try at each height; the best one depends on sensor, height and junction."""
+PITCHES_DEG = (0.0, -5.0, -10.0)
+"""Tilts to try at each height, in equal steps from level: :data:`SENSOR` sees all around.
+
+The best one depends on sensor, height and junction. "aim" is for sensors with a narrow field of view: the middle ray of
+:data:`SENSOR` is 5 degrees below level, so that from a low pole it would point its nose up."""
 
 TomlTable = tuple[str, dict[str, Any]]
 """A comment, and the keys of a table."""
@@ -58,7 +61,10 @@ _KEY_COMMENTS = {  # of tables and keys; the table of a key above all tables is 
     ("score", "rank_by"): "the expected share of vehicles that detectors find; docs/validity.md",
     ("score", "zones"): "results are also reported for these areas; edit, add or remove them as you like",
     ("sites", "aim"): "sensors face the centre of the region",
-    ("sites", "pitch_deg"): "each height with each tilt is a candidate; 'aim': the central ray points at the centre",
+    (
+        "sites",
+        "pitch_deg",
+    ): "each height with each tilt is a candidate; 'aim' points the central ray at the centre: for narrow views",
 }
 
 

@@ -21,7 +21,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from egvs.creation import junctions, scenario_files
 from egvs.creation.junctions import StreetJunction, Streets
 from egvs.formats import spreadsheets
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
+from egvs.traffic import capacity
 from egvs.traffic.approaches import TURN_WORDS, ApproachIndex, ApproachMovement, parse_lane_group
 from egvs.traffic.movements import MovementNames
 
@@ -94,12 +95,18 @@ class StreetCounts:
         What was assumed, and which movements have no count.
     split
         Approaches whose turns are assumed.
+    uncounted
+        Where no vehicle is, because none was counted: movements, approaches, or movements of an hour.
+    excess
+        Which counts exceed what lanes can carry, in sentences.
     """
 
     path: Path
     hours: tuple[CountedHour, ...]
     notes: tuple[str, ...]
     split: tuple[str, ...]
+    uncounted: tuple[str, ...] = ()
+    excess: tuple[str, ...] = ()
 
     is_recorded = False
 
@@ -111,7 +118,10 @@ class StreetCounts:
     @property
     def assumptions(self) -> list[str]:
         """Assumptions, for the key ``assumed``."""
-        return [f"turns of the approaches {', '.join(self.split)}"] if self.split else []
+        assumed = [f"turns of the approaches {', '.join(self.split)}"] if self.split else []
+        if self.uncounted:
+            assumed.append(f"no vehicles in uncounted movements: {list_first(self.uncounted, _MAX_NAMED)}")
+        return assumed
 
     def describe(self) -> str:
         """Return a sentence."""
@@ -127,8 +137,8 @@ class StreetCounts:
         return f"vehicles an hour {counted}: {', '.join(amounts)}"
 
     def warnings(self, _scenario_file: Path) -> Iterator[str]:
-        """Yield nothing: notes say what is assumed."""
-        yield from ()
+        """Yield which counts exceed what lanes can carry; notes say what is assumed."""
+        yield from self.excess
 
     def add_keys(self, table: Any, streets: Streets, junction: StreetJunction) -> None:
         """Add the counts to ``[traffic]``; several hours become periods."""
@@ -171,7 +181,16 @@ def read_junction_counts(path: Path, streets: Streets, junction: StreetJunction)
     index = ApproachIndex.of_flows(flows, MovementNames(streets.network, junction.at_m, flows))
     edges = frozenset(edge.id for edge in streets.network.edges)
     kinds = frozenset(kind.name for kind in TrafficConfig.model_fields["kinds"].default)
-    return read_street_counts(path, flows, index, edges, kinds)
+    counts = read_street_counts(path, flows, index, edges, kinds)
+    excess: dict[str, None] = {}
+    for hour in counts.hours:
+        names = MovementNames(streets.network, junction.at_m, [*flows, *hour.flows])
+        for place, per_hour, lanes in capacity.find_excess(streets.network, names, hour.flows):
+            excess[
+                f"{path}: {place}: {per_hour:,.0f} vehicles an hour exceed what {number_of(lanes, 'lane')} can carry,"
+                f" at most {lanes * capacity.LANE_PER_H:,.0f}. Check the count."
+            ] = None
+    return replace(counts, excess=tuple(excess))
 
 
 def read_street_counts(
@@ -241,7 +260,8 @@ def read_street_counts(
     notes = list(_notes(rows, counted, split, flows, index))
     if empty:
         notes.append(f"Hours without a vehicle are left out: {', '.join(hour.name for hour in empty)}.")
-    return StreetCounts(path, tuple(counted), tuple(notes), split)
+    uncounted = [*_uncounted(rows, flows, index), *(f"those of {name}" for name in _incomplete_hours(counted))]
+    return StreetCounts(path, tuple(counted), tuple(notes), split, tuple(uncounted))
 
 
 def _to_flows(
@@ -293,14 +313,27 @@ def _notes(
                 f"Counts of a part of the hour {hour.name} are scaled up to an hour for {movements}:"
                 f" {list_first(parts, _MAX_NAMED)}."
             )
-    titles = [{flow.title for flow in hour.flows} for hour in hours]
-    incomplete = [hour.name for hour, known in zip(hours, titles, strict=True) if known != set.union(*titles)]
-    if incomplete:
+    if incomplete := _incomplete_hours(hours):
         yield f"Movements that were not counted in an hour get no vehicles in it: {', '.join(incomplete)}."
+    if uncounted := _uncounted(rows, flows, index):
+        yield f"Movements without a count get no vehicles: {', '.join(uncounted)}."
+
+
+def _incomplete_hours(hours: Sequence[CountedHour]) -> list[str]:
+    """Return the hours in which fewer movements were counted than in others."""
+    titles = [{flow.title for flow in hour.flows} for hour in hours]
+    return [hour.name for hour, known in zip(hours, titles, strict=True) if known != set.union(*titles)]
+
+
+def _uncounted(rows: Sequence[_Row], flows: Sequence[CountConfig], index: ApproachIndex) -> list[str]:
+    """Return the movements without a count; an approach without any is named as such."""
     counted = {move.flow.title for row in rows for move in row.movements}
     missing = [move for move in index.movements if move.flow.title not in counted]
-    if missing and len(missing) < len(flows):
-        yield f"Movements without a count get no vehicles: {', '.join(dict.fromkeys(map(_movement_name, missing)))}."
+    if len(missing) == len(flows):  # the counts are at edges
+        return []
+    on_counted = {move.approach_title for move in index.movements if move.flow.title in counted}
+    names = [_movement_name(move) if move.approach_title in on_counted else move.approach_title for move in missing]
+    return sorted(dict.fromkeys(names), key=lambda name: [not name.startswith(title) for title in index.titles])
 
 
 def _movement_name(move: ApproachMovement) -> str:

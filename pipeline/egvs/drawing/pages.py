@@ -1,4 +1,4 @@
-"""The frame of every page: one environment of templates, and percentages that stay on one line.
+"""The frame of every page: one environment of templates, and numbers that stay on one line with their units.
 
 A page is one file that loads nothing from elsewhere. Its template has the folder of its module; the style sheet that
 pages share (``style.css.j2``) is beside this module.
@@ -23,7 +23,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 _NOT_TEXT = re.compile(r"(<(script|style)\b.*?</\2>)", re.DOTALL)
 _TEXT = re.compile(r">[^<>]+")
-_SPACE_BEFORE_SIGN = re.compile(r"(?<=\d) (?=%)")
+_SPACE_BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|m\b)")
 
 
 def page_environment(folder: Path, **filters: Callable[..., Any]) -> Environment:
@@ -65,20 +65,20 @@ def page_environment(folder: Path, **filters: Callable[..., Any]) -> Environment
 
 def render(environment: Environment, template: str, **values: Any) -> str:
     """Return a page, HTML text, from its template and the values in it."""
-    return keep_percentages_together(environment.get_template(template).render(values))
+    return keep_units_together(environment.get_template(template).render(values))
 
 
-def keep_percentages_together(html: str) -> str:
-    """Return a page on which no line begins with the sign of a percentage: its space does not break.
+def keep_units_together(html: str) -> str:
+    """Return a page on which no line begins with the sign of a percentage or "m": its space does not break.
 
     Attributes, scripts and style sheets stay as they are.
 
-    >>> keep_percentages_together('<p title="5 %">5 %</p>').replace("\\u00a0", "_")
+    >>> keep_units_together('<p title="5 %">5 %</p>').replace("\\u00a0", "_")
     '<p title="5 %">5_%</p>'
     """
     parts = _NOT_TEXT.split(html)
     for number in range(0, len(parts), 3):  # text, then the two groups of a script or style sheet
-        parts[number] = _TEXT.sub(lambda match: _SPACE_BEFORE_SIGN.sub("\u00a0", match[0]), parts[number])
+        parts[number] = _TEXT.sub(lambda match: _SPACE_BEFORE_UNIT.sub("\u00a0", match[0]), parts[number])
         if number + 2 < len(parts):
             parts[number + 2] = ""
     return "".join(parts)

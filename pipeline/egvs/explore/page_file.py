@@ -32,8 +32,15 @@ from egvs.explore.server import start_server, stop_server
 from egvs.explore.session import MovingPlan, Playback, PoseScore, Session
 from egvs.explore.settings import Settings
 from egvs.explore.view_state import LAYERS, View
+from egvs.report.plan_section import plan_headline
+from egvs.report.ranking_text import headline
+from egvs.report.sensor_text import detection_level, plan_level
+from egvs.results.levels import read_levels
 from egvs.results.map_credits import read_map_credits
+from egvs.results.plans import SensorPlan
+from egvs.results.ranking import Ranking, site_titles
 from egvs.scoring.targets import SEEN_WELL_POINTS
+from egvs.sensors.sites import has_relief
 
 MAX_RANKED = 10
 """Number of sites in the panel's ranking."""
@@ -172,6 +179,7 @@ def _record(
             for one in ranked[:MAX_RANKED]
         ],
         "sites": len(ranked),
+        "headline": _headline(session),
         "plan": None if plan is None else _plan_values(plan),
         "sensor": rating.site.name,
         "layers": layers,
@@ -226,6 +234,21 @@ def _draw_layers(
             title = f"{title}: {rating.site.name}"
         layers.append(_Layer(name, title, node, Markup(legend)))
     return [*layers, _Layer(_NO_LAYER, LAYERS[_NO_LAYER], "", Markup())]
+
+
+def _headline(session: Session) -> str:
+    """Return the answer as the report gives it, with the error of the level: the plan, or the best site without one."""
+    work = session.work
+    ranking = Ranking.read(work.folder.scores)
+    best = ranking.sites[0]
+    groups, relief = read_levels(work.folder.levels, best.site), has_relief(work.scenario)
+    planned = SensorPlan.read(work.folder) if session.plan is not None else None
+    if planned is not None and planned.sensors:
+        titles = site_titles(planned.sensors, has_relief=relief, is_moved=planned.refinement is not None)
+        found = plan_level(work.scenario, [sensor.sensor for sensor in planned.sensors], groups)
+        return plan_headline(planned, titles, found)
+    found = detection_level(work.scenario, work.scenario.score.ranking_detectors, best.sensor, groups)
+    return headline(ranking, True, found, site_titles(ranking.sites, has_relief=relief))
 
 
 def _plan_values(plan: MovingPlan) -> dict[str, Any]:

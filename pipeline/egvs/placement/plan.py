@@ -193,6 +193,21 @@ def planned_request(folder: Path) -> dict[str, Any] | None:
     return request
 
 
+def planned_mounts(folder: Path) -> list[tuple[Any, ...]]:
+    """Return the sensors of the plan in a run folder (:func:`mount_of`); empty if there is no valid plan."""
+    try:
+        planned = SensorPlan.read(RunFolder(folder))
+    except InputError:
+        return []
+    return [] if planned is None else list(map(mount_of, planned.sensors))
+
+
+def mount_of(sensor: PlannedSensor) -> tuple[Any, ...]:
+    """Return what has to be installed: the site, the sensor and its pose."""
+    pose = (sensor.x_m, sensor.y_m, sensor.z_m, sensor.yaw_deg, sensor.pitch_deg, sensor.roll_deg)
+    return sensor.site, sensor.sensor, *(round(value, 6) for value in pose)
+
+
 def place(
     scenario: Scenario,
     out: str | Path | None = None,

@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from egvs.artefacts.tpog import Tpog
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.threads import map_ordered
+from egvs.core.wording import number_of
 from egvs.kernels import submodular
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import OccupiedVoxels
@@ -323,9 +324,11 @@ class PlanRules:
         without_rules = replace(unlimited, most_per_pole=len(self.cost), least_distance_m=0.0)
         if unlimited.allowed_additions(plan).any() or not without_rules.allowed_additions(plan).any():
             return ""
+        per_pole = f"the limit of {number_of(self.most_per_pole, 'sensor')} per pole (most_per_pole)"
+        distance = f"the distance of {self.least_distance_m:g} m (least_distance_m)"
         rules = {
-            f"most_per_pole = {self.most_per_pole}": replace(without_rules, most_per_pole=self.most_per_pole),
-            f"least_distance_m = {self.least_distance_m:g}": replace(unlimited, most_per_pole=len(self.cost)),
+            per_pole: replace(without_rules, most_per_pole=self.most_per_pole),
+            distance: replace(unlimited, most_per_pole=len(self.cost)),
         }
         free = without_rules.allowed_additions(plan)
         return " and ".join(name for name, alone in rules.items() if (free & ~alone.allowed_additions(plan)).any())

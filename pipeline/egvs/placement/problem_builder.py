@@ -19,6 +19,7 @@ from egvs.artefacts.tpog import Tpog, read_periods, read_tpog
 from egvs.core.errors import InputError, choose_one
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.threads import map_ordered
+from egvs.core.wording import list_first
 from egvs.effects.base import Detect
 from egvs.placement import problem
 from egvs.placement.problem import CoverageTerm, Demand, PlanRules, Problem, VisibilityMatrix, VisibilityRow
@@ -463,13 +464,13 @@ def rules_from_config(scenario: Scenario, sites: Sequence[Site]) -> PlanRules:
         pole_index.setdefault(site.pole or site.name, len(pole_index))
     pole = np.array([pole_index[site.pole or site.name] for site in sites], dtype=np.int64)
 
-    forced = tuple(_candidate_index(name, names, f"{table}.forced") for name in placement.forced)
+    forced = tuple(_candidate_index(name, sites, f"{table}.forced") for name in placement.forced)
     excluded = np.zeros(len(sites), dtype=np.bool_)
     for name in placement.excluded:
         if name in pole_index and name not in names:
             excluded |= pole == pole_index[name]
         else:
-            excluded[_candidate_index(name, names, f"{table}.excluded")] = True
+            excluded[_candidate_index(name, sites, f"{table}.excluded")] = True
     for candidate in forced:
         if excluded[candidate]:
             problem_text = f"{names[candidate]} is forced, but it or its pole is excluded"
@@ -503,10 +504,19 @@ def rules_from_config(scenario: Scenario, sites: Sequence[Site]) -> PlanRules:
     return rules
 
 
-def _candidate_index(name: str, names: list[str], where: str) -> int:
+def _candidate_index(name: str, sites: Sequence[Site], where: str) -> int:
+    """Return the index of a candidate by its name, or by that of its pole if it is the only one there."""
+    names = [site.name for site in sites]
     if name in names:
         return names.index(name)
-    raise InputError(where, f"no candidate {name!r}", choose_one(name, names))
+    on_pole = [number for number, site in enumerate(sites) if site.pole == name]
+    if len(on_pole) == 1:
+        return on_pole[0]
+    if on_pole:
+        listed = list_first([names[number] for number in on_pole], 8)
+        raise InputError(where, f"pole {name!r} has {len(on_pole)} candidates", f"Choose one of {listed}.")
+    poles = dict.fromkeys(site.pole or site.name for site in sites)
+    raise InputError(where, f"no candidate or pole {name!r}", choose_one(name, list(poles)))
 
 
 def _check_count(scenario: Scenario, n_allowed: int, n_sites: int, n_forced: int) -> None:

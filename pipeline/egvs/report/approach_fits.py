@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts import parquet
-from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS
 from egvs.core.errors import InputError
 from egvs.scenario.model import Scenario
 from egvs.traffic import approach_queues, observed

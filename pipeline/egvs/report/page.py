@@ -54,6 +54,7 @@ from egvs.report.sections import (
     assumptions,
     busiest_counts,
     describe_counts,
+    describe_missing_traffic,
     describe_poles_on_road,
     main_assumptions,
     study_values,
@@ -311,7 +312,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         stages,
         study=study_values(work.folder, stages),
         by_period=PeriodRanking.read(out),
-        plan=None if plan is None else _plan_values(plan, titles),
+        plan=None if plan is None else _plan_values(plan, work, best.site),
         titles=titles,
         answer_map=_draw_answer(work, plan, ranking, tpog, backdrop),
         what_if=_read_what_ifs(work, stages, best),
@@ -349,10 +350,16 @@ def _read_plan(folder: RunFolder, stages: Mapping[str, StageRecord]) -> SensorPl
     return plan if plan is not None and plan.belongs_to(stages) else None
 
 
-def _plan_values(plan: SensorPlan, titles: Mapping[str, str]) -> dict[str, Any]:
+def _plan_values(plan: SensorPlan, work: StageContext, best: str) -> dict[str, Any]:
     from egvs.report.plan_section import plan_headline, plan_values
 
-    headline = plan_headline(plan, titles) if plan.sensors else ""
+    headline = ""
+    if plan.sensors:
+        relief, moved = has_relief(work.scenario), plan.refinement is not None
+        titles = site_titles(plan.sensors, has_relief=relief, is_moved=moved)
+        sensors = [sensor.sensor for sensor in plan.sensors]
+        found = sensor_text.plan_level(work.scenario, sensors, read_levels(work.folder.levels, best))
+        headline = plan_headline(plan, titles, found)
     return {**plan_values(plan), "plan_headline": headline}
 
 
@@ -554,6 +561,7 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
     assumed = assumptions(contents.scenario, traffic_summary(contents.stages).get("signals", ()))
     return {
         "warnings": by_severity(warnings),
+        "missing_traffic": describe_missing_traffic(warnings),
         "main_assumptions": main_assumptions(assumed),
         "reliability": reliability,
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),

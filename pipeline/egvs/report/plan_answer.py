@@ -15,6 +15,7 @@ from typing import Any
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.wording import format_percent
 from egvs.results.labels import ScoreLabel, join_names
+from egvs.results.levels import NOT_MEASURED, DetectionLevel
 from egvs.results.plans import PlannedSensor, PlanStep, SensorPlan
 from egvs.scenario.score_config import is_plugin_score
 
@@ -39,6 +40,37 @@ def describe_plan_count(plan: SensorPlan) -> str:
         next_count=next_count(plan),
         forbids_more=plan.forbids_more,
     )
+
+
+def describe_share(plan: SensorPlan, found: DetectionLevel) -> str:
+    """Return what a plan achieves: what detectors should find, with the error of their level, also in fused clouds.
+
+    Parameters
+    ----------
+    plan
+        The plan.
+    found
+        What is known of the share that detectors find from its sensors; without detectors for a score that has none.
+
+    Returns
+    -------
+    str
+        E.g. "should find 92 ± 7 % of vehicles (86 ± 7 % in fused clouds)". For a score without detectors it has the
+        standard error: "scores 99,220 ± 300 bit".
+    """
+    if not found.detectors:
+        return plan.by.says.format(plan.by.with_unit(plan.joint, plan.joint_se))
+    if not found.is_measured:
+        return f"has sensors for whose detectors the {NOT_MEASURED.replace('level', 'level was')}"
+    text = plan.by.says.format(found.joint_text(plan.joint, _se_or_none(plan.joint_se)))
+    if plan.fused is not None and len(plan.fused.steps) > 1:
+        last = plan.fused.steps[-1]
+        text += f" ({found.joint_text(last.score, _se_or_none(last.score_se))} in fused clouds)"
+    return text
+
+
+def _se_or_none(se: float) -> float | None:
+    return None if math.isnan(se) else se
 
 
 def describe_objective(request: Mapping[str, Any]) -> str:
@@ -132,9 +164,8 @@ def describe_count(
         n_sensors = len(steps[-1].sites)
         steps = [step for step in steps if step.count <= n_sensors] or steps[:1]
         verb = "forbid" if " and " in forbids_more else "forbids"
-        try_next = (
-            f"{forbids_more} {verb} {_ordinal(n_sensors + 1)} sensor beside {'it' if n_sensors == 1 else 'them'}."
-        )
+        them = "it" if n_sensors == 1 else "them"
+        try_next = f"{_capitalise(forbids_more)} {verb} {_ordinal(n_sensors + 1)} sensor beside {them}."
     elif next_count is not None:
         try_next = f"Try --count {next_count} to see what {_ordinal(next_count)} adds."
     if len(steps) < 2:

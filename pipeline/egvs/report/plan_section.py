@@ -11,6 +11,7 @@ from egvs.drawing.maps import PlannedPole
 from egvs.drawing.svg_figures import CurveStep
 from egvs.report import plan_answer
 from egvs.results.labels import join_names
+from egvs.results.levels import DetectionLevel
 from egvs.results.plans import PlannedSensor, SensorPlan
 
 _MAX_NAMED = 3
@@ -53,22 +54,23 @@ def _describe_proof(plan: SensorPlan) -> str:
     return f"it is not proved that {fewer} not enough"
 
 
-def plan_headline(plan: SensorPlan, titles: Mapping[str, str]) -> str:
-    """Return the plan and its joint score in one sentence; sensors are named where they are few.
+def plan_headline(plan: SensorPlan, titles: Mapping[str, str], found: DetectionLevel) -> str:
+    """Return the plan and what it achieves in one sentence; sensors are named where they are few.
 
     Parameters
     ----------
     plan
         The plan, of at least one sensor.
     titles
-        What people call its sites (:func:`egvs.results.ranking.site_titles`).
+        What people call its sensors (:func:`egvs.results.ranking.site_titles`).
+    found
+        As for :func:`egvs.report.plan_answer.describe_share`.
     """
     count = len(plan.sensors)
     names = "; ".join(titles[sensor.site] for sensor in plan.sensors)
-    if count > _MAX_NAMED or plan.refinement is not None:  # the titles are those of candidates
+    if count > _MAX_NAMED:
         names = join_names(list(dict.fromkeys(sensor.pole for sensor in plan.sensors)))
-    score = plan.by.says.format(plan.by.with_unit(plan.joint, plan.joint_se))
-    return f"The plan of {number_of(count, 'sensor')} {score}: {names}"
+    return f"The plan of {number_of(count, 'sensor')} {plan_answer.describe_share(plan, found)}: {names}"
 
 
 def planned_poles(plan: SensorPlan) -> list[PlannedPole]:

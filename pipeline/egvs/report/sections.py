@@ -19,6 +19,7 @@ from egvs.results.ranking import Pole
 from egvs.scenario.model import NO_SURROUNDINGS, POLE_POSITIONS, Scenario
 from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.scenario.traffic_config import CountConfig
+from egvs.traffic.directions import COMPASS
 from egvs.traffic.signal_descriptions import ASSUMED_SOURCE, plan_title
 
 NAMED_POLES = 5
@@ -29,6 +30,9 @@ _FURTHER_SITES = re.compile(r" and \d+ more$")
 
 _SITES_ON_LANES = "sites on lanes"
 """Rule of the warnings of a check about sites in lanes or junctions."""
+
+_NOT_STARTED = "waiting"
+"""Rule of the warning that several per cent of the vehicles could not start."""
 
 _TRAFFIC = re.compile(r"\btraffic\b(?! (?:light|sign))", re.IGNORECASE)
 """Found in entries of the key ``assumed`` on traffic; traffic lights and signs are not traffic."""
@@ -70,12 +74,20 @@ def assumptions(scenario: Scenario, plans: Sequence[Mapping[str, Any]]) -> tuple
     return (*assumed, "traffic (random trips)")
 
 
-_BY_IMPORTANCE = ("traffic", "building is known", "surroundings", "positions", "signal", "heights of .*building")
+_BY_IMPORTANCE = (
+    "traffic",
+    "uncounted",
+    "building is known",
+    "surroundings",
+    "positions",
+    "signal",
+    "heights of .*building",
+)
 """Beginnings of what scenarios assume, that which affects a ranking most first; all other entries follow."""
 
 
 _LONG = 75
-"""Longer lists of assumptions leave out what is in brackets."""
+"""Longer lists of assumptions leave out what is in brackets, except sides of approaches, and name one of several."""
 
 
 def main_assumptions(assumed: Sequence[str], count: int = 2) -> str:
@@ -89,10 +101,20 @@ def main_assumptions(assumed: Sequence[str], count: int = 2) -> str:
 
     if not assumed:
         return ""
-    named = list_first(sorted(assumed, key=order), count, "; ")
+    entries = sorted(assumed, key=order)
+    named = list_first(entries, count, "; ")
     if len(named) > _LONG:
-        named = re.sub(r" \([^)]*\)", "", named)
+        without_lists = [re.sub(r"(: [^,]+), .*", r"\1 and others", entry) for entry in entries]
+        named = re.sub(rf" \((?!{'|'.join(COMPASS)})[^)]*\)", "", list_first(without_lists, count, "; "))
     return f"Assumed, not measured: {named}."
+
+
+def describe_missing_traffic(warnings: Iterable[Diagnostic]) -> str:
+    """Return that many vehicles could not start, in one sentence; empty if the warnings of a run do not say so."""
+    for warning in warnings:
+        if warning.rule == _NOT_STARTED:
+            return f"Careful: {warning.problem.partition(', because')[0]}, so the traffic is less than the demand."
+    return ""
 
 
 def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]) -> list[str]:

@@ -102,6 +102,11 @@ def detection_level(
     return DetectionLevel(tuple(detectors), tuple(groups), has_losses(scenario, [sensor]))
 
 
+def plan_level(scenario: Scenario, sensors: Sequence[str], groups: Sequence[GroupLevel]) -> DetectionLevel:
+    """Return what is known of the share that detectors find from the sensors of a plan (:func:`detection_level`)."""
+    return DetectionLevel(tuple(scenario.score.ranking_detectors), tuple(groups), has_losses(scenario, sensors))
+
+
 def upper_limit_note(scenario: Scenario, sensors: Iterable[str]) -> str:
     """Return a sentence if what people would notice is an upper limit, as sensors lose no returns; else empty.
 

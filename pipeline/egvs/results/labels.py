@@ -94,11 +94,13 @@ class ScoreLabel:
         """Return a standard error as text: in percentage points for shares, relative to the value otherwise."""
         if se is None or math.isnan(se) or not value > 0:
             return "-"
-        return f"±{format_percent(se)}" if self.is_share else format_percent(se / value)
+        if self.is_share:
+            return f"±{self._error_number(se)} %" if se else "-"
+        return format_percent(se / value)
 
     def with_error(self, value: float, se: float) -> str:
-        """Return a value and its error, without unit, e.g. "94.6 ± 0.9 %"; the value alone if ``se`` is NaN."""
-        if math.isnan(value) or math.isnan(se):
+        """Return a value and its error, without unit, e.g. "94.6 ± 0.9 %"; the value alone if ``se`` is NaN or 0."""
+        if math.isnan(value) or not se > 0.0:
             return self.value(value)
         text = f"{self._number(value)} ± {self._error_number(se)}"
         return f"{text} %" if self.is_share else text

@@ -249,6 +249,16 @@ class DetectionLevel:
             return self.range.text
         return _format_found(share, self.error(se))
 
+    def joint_text(self, share: float, se: float | None) -> str:
+        """Return the share that several sensors find together, with the level error of single sensors.
+
+        No level of several sensors was measured. Where a number of one site would not be supported, it is the range
+        from the share if none of the vehicles outside of :attr:`measured_groups` was found to the share if all were.
+        """
+        if self.range is not None:
+            return format_range(max(0.0, share - self.range.outside), share + self.range.outside)
+        return _format_found(share, self.error(se))
+
     def group_text(self, level: GroupLevel) -> str:
         """Return the share found of one group in the same way; :data:`NOT_MEASURED` for a group that was not measured.
 

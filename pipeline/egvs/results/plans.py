@@ -249,6 +249,11 @@ class FusedPlan:
     noticed: NoticedShare | None = None
 
 
+def _fused_step(count: int, score: float, score_se: float | None) -> PlanStep:
+    """Return the joint score of the first sensors in fused clouds, from the metadata of a plan."""
+    return PlanStep(count, score, math.nan, True, math.nan if score_se is None else score_se)
+
+
 @dataclass(frozen=True)
 class SensorPlan:
     """A plan of several sensors and its certificate.
@@ -278,7 +283,8 @@ class SensorPlan:
     fewest_is_proved
         Whether it is proved that one sensor fewer cannot meet the requirements; None if this was not requested.
     forbids_more
-        The rules that forbid any further sensor, e.g. ``"most_per_pole = 1"``; empty if one may be added.
+        The rules that forbid any further sensor, e.g. ``"the limit of 1 sensor per pole (most_per_pole)"``; empty if
+        one may be added.
     errors_from
         How the standard errors were computed; or the reason why there are none.
     stages
@@ -286,8 +292,8 @@ class SensorPlan:
     refinement
         With refined poses, what the refinement did; ``sensors``, ``joint``, ``cost`` and ``zones`` are those after it.
     fused
-        What the sensors are expected to find in their fused point clouds; None in a plan that was read, without
-        sensors, and for joint scores that do not take sensors as independent.
+        What the sensors are expected to find in their fused point clouds; None without sensors, and for joint scores
+        that do not take sensors as independent. A plan that was read has its steps only.
     zone_results
         What the sensors find together in the zones of ``[score] zones``; empty in a plan that was read.
     files
@@ -332,6 +338,9 @@ class SensorPlan:
             moves = plan["moves"]
             names = ("before", "value_before", "value", "tried", "impossible", "turns")
             refinement = RefinementSummary(*(moves[name] for name in names))
+        fused = None
+        if "fused" in plan:
+            fused = FusedPlan(tuple(_fused_step(count, *values) for count, values in enumerate(plan["fused"], start=1)))
         return cls(
             sensors=tuple(PlannedSensor(**row) for row in rows),
             curve=plan_steps(curve_rows),
@@ -348,6 +357,7 @@ class SensorPlan:
             errors_from=plan.get("standard_errors", "the plan was made by an older version of egvs place"),
             stages=metadata["stages"],
             refinement=refinement,
+            fused=fused,
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -370,6 +380,11 @@ class SensorPlan:
         }
         if self.forbids_more:
             plan["forbids_more"] = self.forbids_more
+        if self.fused is not None:
+            plan["fused"] = [
+                [None if math.isnan(value) else value for value in (step.score, step.score_se)]
+                for step in self.fused.steps
+            ]
         if self.refinement is not None:  # without its duration: equal plans are equal files
             plan["moves"] = {
                 "before": self.refinement.joint_before,

@@ -259,7 +259,7 @@ _HEIGHT_IN_NAME = re.compile(r"@([0-9.]+)m")
 """What :mod:`egvs.sensors.sites` adds to the name of a site that has several heights; it counts from the ground."""
 
 
-def describe_mount(mount: Mounted, *, has_relief: bool = False) -> str:
+def describe_mount(mount: Mounted, *, has_relief: bool = False, is_moved: bool = False) -> str:
     """Return height and tilt of a sensor in words, e.g. "3 m up, level" or "4.5 m up, tilted 10° down".
 
     Parameters
@@ -268,8 +268,10 @@ def describe_mount(mount: Mounted, *, has_relief: bool = False) -> str:
         The sensor.
     has_relief
         Whether the ground is elsewhere than at z = 0, so that z is no height above it.
+    is_moved
+        Whether the sensor may be at another height than its name says (``egvs place --refine``).
     """
-    named = _HEIGHT_IN_NAME.search(mount.site.removeprefix(mount.pole))
+    named = None if is_moved else _HEIGHT_IN_NAME.search(mount.site.removeprefix(mount.pole))
     if named is not None:
         height = f"{named[1]} m up"
     else:
@@ -299,7 +301,7 @@ def is_named_after_pole(mount: Mounted) -> bool:
     return rest != mount.site and not rest[:1].isalnum()
 
 
-def site_titles(mounts: Iterable[Mounted], *, has_relief: bool = False) -> dict[str, str]:
+def site_titles(mounts: Iterable[Mounted], *, has_relief: bool = False, is_moved: bool = False) -> dict[str, str]:
     """Return what people call sites, by their names, e.g. "pole k04, 3 m up, level" for "k04@3m+0deg".
 
     A site with a name of its own on the pole of another is called by it, e.g. "site c10, 3 m up, level". Sites that
@@ -310,7 +312,7 @@ def site_titles(mounts: Iterable[Mounted], *, has_relief: bool = False) -> dict[
         name = mount.pole if "pole" in mount.pole.lower() else f"pole {mount.pole}"
         if not is_named_after_pole(mount):
             name = f"site {mount.site}"
-        titles[mount.site] = f"{name}, {describe_mount(mount, has_relief=has_relief)}"
+        titles[mount.site] = f"{name}, {describe_mount(mount, has_relief=has_relief, is_moved=is_moved)}"
     count = Counter(titles.values())
     return {site: title if count[title] == 1 else f"{title} ({site})" for site, title in titles.items()}
 

@@ -41,6 +41,7 @@ from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
 from egvs.scenario.loading import check_is_scenario, scenario_from_dict
 from egvs.scenario.model import Scenario
+from egvs.scenario.score_config import is_plugin_score
 from egvs.stages import inputs as stage_inputs
 from egvs.stages.base import StageContext, WorkAhead
 from egvs.stages.inputs import Inputs
@@ -111,6 +112,10 @@ def run(
     True
     """
     check_is_scenario(scenario)
+    if is_plugin_score(scenario.score.rank_by):  # a broken one is reported before anything is computed
+        from egvs.scoring.target_scores import load_vehicle_score
+
+        load_vehicle_score(scenario.score.rank_by)
     open_context = partial(open_folder, scenario, jobs=jobs, progress=progress)
     with _start_run(scenario, out, listener, open_context, wait_s) as current:
         return current.run_stages(only, options or {})

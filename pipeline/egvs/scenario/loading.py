@@ -22,7 +22,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from egvs.core import files, reading
-from egvs.core.errors import InputError, format_problem
+from egvs.core.errors import InputError, check_list, format_problem
 from egvs.core.grid import Grid
 from egvs.core.numbers import WrittenNumber, ambiguous_number, number_or_nan
 from egvs.core.table_columns import parse_header
@@ -191,6 +191,7 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     """
     path = Path(path)
     files.check_utf8("the scenario", str(path.absolute()))
+    check_list("overrides", overrides)
     overrides = tuple(overrides)
     if path.name == os.fspath(path) and path.name in shipped_names() and not path.exists():
         path = shipped_scenario(path.name)

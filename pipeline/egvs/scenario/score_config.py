@@ -14,7 +14,7 @@ from pydantic import (
     model_validator,
 )
 
-from egvs.core import limits, plugins
+from egvs.core import errors, limits, plugins
 from egvs.scenario.fields import Name, NotNegative, Point2, Positive, StrictModel, find_duplicates
 
 VehicleClass = Literal[
@@ -53,7 +53,9 @@ def is_plugin_score(name: str) -> bool:
 def _check_ranking_score(name: str) -> str:
     """Return the name of a score that can rank sites; ValueError for any other, and for one that is not installed."""
     if name not in (known := [*get_args(RankingScore), *plugin_scores()]):
-        raise ValueError(f"expected one of {', '.join(known)}, got {name[:80]!r}")
+        problem = f"expected one of {', '.join(known)}, got {name[:80]!r}"
+        misspelling = errors.find_misspelling([name], known)
+        raise ValueError(f"{problem}; did you mean {misspelling[1]!r}?" if misspelling else problem)
     return name
 
 
@@ -386,7 +388,9 @@ class PlacementConfig(StrictModel):
     reach: Share | None = Field(
         None, description="Find the fewest sensors that reach this share of the score of all candidates together"
     )
-    forced: tuple[str, ...] = Field((), description="Candidates that exist already and are part of every plan")
+    forced: tuple[str, ...] = Field(
+        (), description="Candidates, or poles with one, that exist already and are part of every plan"
+    )
     excluded: tuple[str, ...] = Field((), description="Candidates or poles that must not be used")
     most_per_pole: int | None = Field(None, ge=1, description="Maximum number of sensors on a pole. By default any")
     least_distance_m: NotNegative = Field(0.0, description="Minimum distance between any two sensors")

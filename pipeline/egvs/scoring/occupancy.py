@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.artefacts.frame_boxes import FrameBoxes
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS, FrameBoxes
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.wording import format_percent
@@ -104,21 +104,27 @@ def static_voxels(world: World, grid: Grid) -> NDArray[np.bool_]:
     return filled
 
 
-def warn_empty_region(boxes: float, trajectories: Path) -> Iterator[Diagnostic]:
-    """Warn where fewer than two vehicles are in the region of interest on average.
+def has_people(trajectories: Path) -> bool:
+    """Return whether boxes of ``trajectories.parquet`` are people on foot or on bicycles."""
+    table, _ = parquet.read_artefact(trajectories, "trajectories", ["kind"])
+    return not NON_VEHICLE_KINDS.isdisjoint(table.column("kind").unique().to_pylist())
+
+
+def warn_empty_region(boxes: float, trajectories: Path, *, people: bool = False) -> Iterator[Diagnostic]:
+    """Warn where fewer than two vehicles are in the region of interest on average; with ``people``, road users.
 
     Where there is none at all, the warning says where ``trajectories.parquet`` has vehicles instead.
     """
-    rule = "traffic in the region"
+    rule, noun = "traffic in the region", "road user" if people else "vehicle"
     if boxes >= clearances.MIN_MEAN_VEHICLES:
         return
     if boxes == 0:
-        problem = f"no vehicle ever enters the region{_traffic_extent(trajectories)}: the sites cannot be ranked"
+        problem = f"no {noun} ever enters the region{_traffic_extent(trajectories)}: the sites cannot be ranked"
         hint = "Move the region to where vehicles drive, add traffic, or check that both use the same coordinates."
         yield Diagnostic(rule, "roi", problem, hint)
     else:
         count = f"{boxes:.2g}"
-        vehicles = "1 vehicle is" if count == "1" else f"{count} vehicles are"
+        vehicles = f"1 {noun} is" if count == "1" else f"{count} {noun}s are"
         problem = f"{vehicles} in the region on average, so the ranking is based on very little traffic"
         hint = "If the streets are busier, correct [traffic]; otherwise record longer (traffic.frames)."
         yield Diagnostic(rule, "roi", problem, hint)

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts.tpog import Tpog
-from egvs.core.errors import InputError, check_instance
+from egvs.core.arguments import check_instance
+from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.wording import format_percent
 from egvs.scoring.egvs import EntropyField

@@ -431,7 +431,10 @@ class VehicleScore:
 
     def __call__(self, visible: TargetVisibility, _: Sequence[str] = ()) -> FloatArray:
         """Return the value of each vehicle-frame; a RunError for anything but one number from 0 to 1 for each."""
-        values = np.asarray(self.function(visible))
+        try:
+            values = np.asarray(self.function(visible))
+        except Exception as error:  # a foreign function may do anything
+            raise RunError(f"score {self.name}: its function raised {error!r}") from error
         n_vehicles = len(visible.points)
         if values.shape != (n_vehicles,) or values.dtype.kind not in "fiub":
             actual = f"{values.dtype} of shape {values.shape}"

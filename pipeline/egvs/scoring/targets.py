@@ -44,8 +44,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet, traffic_frames
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS
 from egvs.artefacts.tpog import PeriodBlocks, read_periods
-from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
+from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.effects.returns import ReturnProbability, reflectivity_of

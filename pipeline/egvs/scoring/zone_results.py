@@ -108,6 +108,8 @@ class ZoneUsers:
         Those of them that no lane for vehicles leads through, in traffic without pedestrians: nobody can be there.
     detectors
         Detectors whose probabilities are averaged.
+    is_recorded
+        Whether the traffic is finished, so that no pedestrians can be simulated.
     """
 
     record: TargetRecord
@@ -115,6 +117,7 @@ class ZoneUsers:
     empty: tuple[str, ...]
     for_pedestrians: tuple[str, ...] = ()
     detectors: tuple[str, ...] = DETECTORS
+    is_recorded: bool = False
 
     @classmethod
     def of(
@@ -201,6 +204,8 @@ class ZoneUsers:
         frames = number_of(len(self.record.numbers), "frame")
         problem = f"no road user has its centre in {list_first(names, _MAX_NAMED)} in the {frames} examined"
         hint = "Check these zones and the traffic; pedestrians need [effects.pedestrians_bicycles]."
+        if self.is_recorded:
+            hint = "Check these zones and the tracks; nobody was recorded there."
         yield Diagnostic("zones", f"{SCENARIO_FILE}: {REPORTED_KEY}", problem, hint)
 
     def describe_for_pedestrians(self) -> str:
@@ -210,6 +215,8 @@ class ZoneUsers:
         zones = number_of(len(self.for_pedestrians), "zone")
         names = list_first(self.for_pedestrians, _MAX_NAMED)
         reason = "the traffic has no pedestrians ([effects.pedestrians_bicycles])"
+        if self.is_recorded:
+            reason = "no pedestrians were recorded"
         return f"no results for {zones} beside the lanes, since {reason}: {names}"
 
 

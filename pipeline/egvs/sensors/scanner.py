@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core.errors import InputError, check_instance
+from egvs.core.arguments import check_instance
+from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Roi, Vec3
 from egvs.core.wording import number_of
 from egvs.formats import point_clouds

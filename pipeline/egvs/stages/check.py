@@ -72,6 +72,10 @@ _RECORDED_TRAFFIC_KEY = "fcd"
 """Last part of the keys that name files of recorded traffic."""
 
 
+NOTES = ("own supports",)
+"""Rules of what is as intended, and is said only where details are asked for."""
+
+
 @dataclass(frozen=True)
 class CheckReport:
     """Findings of a check.
@@ -99,8 +103,13 @@ class CheckReport:
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """The findings that do not stop a run."""
-        return tuple(finding for finding in self.findings if not finding.is_error)
+        """The findings that do not stop a run, and are no notes."""
+        return tuple(finding for finding in self.findings if not finding.is_error and finding.rule not in NOTES)
+
+    @property
+    def notes(self) -> tuple[Diagnostic, ...]:
+        """The findings of the rules in :data:`NOTES`."""
+        return tuple(finding for finding in self.findings if finding.rule in NOTES)
 
 
 @dataclass(frozen=True)
@@ -318,6 +327,8 @@ def run(
     losses = scene_inputs.scenario_losses(context.scenario, context.inputs.candidates)
     if losses is not None and losses.notes:
         summary["losses"] = list(losses.notes)
+    if report.notes:
+        summary["notes"] = [finding.problem for finding in report.notes]
     summary[WARNINGS_KEY] = [finding.to_json() for finding in report.warnings]
     return summary
 

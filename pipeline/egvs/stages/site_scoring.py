@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS
 from egvs.artefacts.parquet import ArtefactWriter
 from egvs.artefacts.readers import ALL_USERS
 from egvs.artefacts.tpog import PeriodBlocks, Tpog, read_periods, read_tpog
-from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
+from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.threads import map_ordered
@@ -126,7 +127,8 @@ def zone_users(context: StageContext) -> ZoneUsers:
         carriageway = Carriageway.of(network)
     period = _period_of_rows(record, recorded)
     detectors = context.scenario.score.detectors
-    return ZoneUsers.of(record, reported_zones(context.scenario), weight, period, carriageway, detectors)
+    users = ZoneUsers.of(record, reported_zones(context.scenario), weight, period, carriageway, detectors)
+    return replace(users, is_recorded=context.scenario.is_recorded)
 
 
 class TargetScorer:

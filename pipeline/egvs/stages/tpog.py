@@ -76,8 +76,9 @@ def run(context: StageContext, inputs: StageDependencies, ahead: BlocksAhead | N
     -------
     dict
         ``occupied_voxels``, ``static_voxels`` (left out), ``boxes_in_roi`` (mean per frame of the mix),
-        ``memory_frames``; ``unknown_gaps``, ``scaled_voxels`` and ``unknown_voxels`` where recorded tracks have long
-        gaps; ``left_over`` where the frames of a finished file do not fill the blocks; warnings.
+        ``memory_frames``; ``with_people`` where boxes are also people; ``unknown_gaps``, ``scaled_voxels`` and
+        ``unknown_voxels`` where recorded tracks have long gaps; ``left_over`` where the frames of a finished file do
+        not fill the blocks; warnings.
     """
     source = context.folder.trajectories
     scenario = context.scenario
@@ -110,8 +111,9 @@ def run(context: StageContext, inputs: StageDependencies, ahead: BlocksAhead | N
         file.describe(context.metadata(inputs, grid=grid.to_json(), **_frame_metadata(periods)))
 
     mean_boxes = float(np.average(boxes_in_roi, weights=[period.weight for period in periods]))
+    people = occupancy.has_people(source)
     warnings = [
-        *occupancy.warn_empty_region(mean_boxes, source),
+        *occupancy.warn_empty_region(mean_boxes, source, people=people),
         *occupancy.warn_empty_periods({p.name: boxes for p, boxes in zip(periods, boxes_in_roi, strict=True)}),
         *occupancy.warn_traffic_through_solids(writer.hidden, writer.visible, writer.solid, grid, context.world),
     ]
@@ -125,6 +127,8 @@ def run(context: StageContext, inputs: StageDependencies, ahead: BlocksAhead | N
         "memory_frames": memory,
         WARNINGS_KEY: [warning.to_json() for warning in warnings],
     }
+    if people:
+        summary["with_people"] = True
     if unknown is not None:
         summary |= unknown.summary()
     if left_over:

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core.errors import InputError, parse_each
+from egvs.core.errors import InputError, check_list, parse_each
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import number_or_nan, parse_decimal
 from egvs.core.platform import relative_path
@@ -200,6 +200,10 @@ class WhatIfResult:
     best: RankedSite
     notes: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        bests = [f"{answer.name} {answer.best_expected}" for answer in self.answers]
+        return f"WhatIfResult(best {self.best.site}; on average over the time with {', '.join(bests)})"
+
 
 def what_if(
     path: str | Path,
@@ -214,8 +218,12 @@ def what_if(
 
     Parameters
     ----------
-    path, overrides, names
-        As in :func:`prepare_runs`.
+    path
+        The scenario, or a run, whose settings are used.
+    overrides
+        Further settings of all runs, as in :func:`egvs.load`.
+    names
+        Names of the tables; all when empty.
     jobs
         Number of threads; one per core when None. Results do not depend on it.
     progress, listener
@@ -235,6 +243,11 @@ def what_if(
     def run_one(_: int, what_if_run: WhatIfRun) -> None:
         run.run(what_if_run.scenario, what_if_run.folder, jobs=jobs, progress=progress, listener=listener)
 
+    if isinstance(path, Scenario):
+        hint = "Use its folder, path=scenario.folder, and its settings as overrides."
+        raise InputError("path", "expected the folder of a scenario or run, got a Scenario", hint)
+    check_list("overrides", overrides)
+    check_list("names", names)
     result = compare_runs(prepare_runs(Path(path), overrides, names), run_one)
     record_answers(result)
     return result

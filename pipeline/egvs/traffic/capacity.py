@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -29,8 +29,11 @@ from egvs.core import files
 from egvs.formats import xml
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
 from egvs.traffic import demand, sumo, sumo_folder
+from egvs.traffic.approach_names import approach_name
+from egvs.traffic.directions import TURNS, arrival_side
 from egvs.traffic.locks import MOVED_M, SAMPLE_S, StreetNames
-from egvs.traffic.network import Network, read_net_xml
+from egvs.traffic.movements import MovementNames
+from egvs.traffic.network import CAR, Edge, Network, read_net_xml
 
 DURATION_S, WARMUP_S = 900.0, 300.0
 STEP_S = 0.5
@@ -115,6 +118,52 @@ class Capacity:
         if not jams:
             return ""
         return f"a vehicle stood for {jams[-1].longest_standing_s:.0f} s at {jams[-1].longest_standing_at}"
+
+
+LANE_PER_H = 2000.0
+"""Most vehicles an hour that pass a stop line on one lane if it is always green: one every 1.8 s, the saturation flow
+of cars in the German manual (HBS 2015); about 1,900 in the American one (HCM 2016)."""
+
+
+class Excess(NamedTuple):
+    """An approach or a movement, its vehicles per hour, and its lanes, which cannot carry them."""
+
+    place: str
+    per_hour: float
+    lanes: int
+
+
+def find_excess(network: Network, names: MovementNames, flows: Iterable[CountConfig]) -> list[Excess]:
+    """Find the movements, and then the approaches, whose flows exceed :data:`LANE_PER_H` on each of their lanes.
+
+    Parameters
+    ----------
+    network, names
+        The network, and the names of its movements.
+    flows
+        Vehicles per hour; those of several kinds add up.
+    """
+    per_h: dict[tuple[str, str], float] = {}
+    places: dict[tuple[str, str], tuple[str, Edge]] = {}
+    for flow in flows:
+        movement = names.movement(flow.edge or flow.from_edge or "", flow.to_edge)
+        edge = movement.approach[-1]
+        approach = approach_name(arrival_side(movement.heading), movement.street)
+        for turn in dict.fromkeys((movement.turn, "")):
+            per_h[edge.id, turn] = per_h.get((edge.id, turn), 0.0) + flow.per_hour
+            places[edge.id, turn] = f"{approach} {turn}".strip(), edge
+    found: dict[tuple[str, str], Excess] = {}
+    for (edge_id, turn), (place, edge) in sorted(places.items(), key=lambda item: item[0][1] == ""):
+        turning = {
+            connection.source_lane
+            for connection in network.connections
+            if network.edges[connection.source].id == edge_id and TURNS.get(connection.direction) == turn
+        }
+        lanes = len(turning) or edge.lanes_for(CAR)
+        is_named = any(edge_id == other for other, _ in found)
+        if per_h[edge_id, turn] > LANE_PER_H * lanes and not is_named:
+            found[edge_id, turn] = Excess(place, per_h[edge_id, turn], lanes)
+    return list(found.values())
 
 
 def scale_flows(flows: Sequence[CountConfig], share: float) -> list[CountConfig]:

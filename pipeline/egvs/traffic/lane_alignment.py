@@ -84,7 +84,8 @@ class Alignment:
     def warnings(self, where: str) -> Iterator[Diagnostic]:
         """Warn about tracks that do not fit the map."""
         if self.share < MIN_SHARE or self.fits_better:
-            hint = "Check the coordinate system (traffic.track_crs), and whether map and tracks show the same place."
+            key = "--track-crs" if where.startswith("--") else "traffic.track_crs"
+            hint = f"Check the coordinate system ({key}), and whether map and tracks show the same place."
             yield Diagnostic("track alignment", where, self.describe(), hint)
 
 

@@ -720,7 +720,7 @@ def _insertion_warning(prepared: SimulationFolder, scenario: Scenario, fits: Seq
     if waiting <= _MAX_WAITING_SHARE * loaded:
         return []
     problem = (
-        f"{waiting} of {number_of(loaded, 'vehicle')} could not start, because the streets where they start are full"
+        f"{waiting:,} of {number_of(loaded, 'vehicle')} could not start, because the streets where they start are full"
     )
     if fits:
         worst = max(fits, key=lambda fit: fit.counted_per_h - fit.simulated_per_h)

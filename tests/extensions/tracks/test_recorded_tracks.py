@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -101,6 +102,17 @@ def test_wrong_time_does_not_make_billions_of_frames(mini: Path) -> None:
         recorded_tracks.tracks_window(egvs.load(mini))
 
 
+def test_times_in_another_unit_are_named(mini: Path) -> None:
+    """Without traffic.frames, all of 0.019 s would be used, which do not fill the blocks."""
+    use_tracks(mini, interaction_csv([(name, time_s / 1000, *rest) for name, time_s, *rest in boxes_of_fcd()]))
+    text = (mini / "scenario.toml").read_text()
+    (mini / "scenario.toml").write_text(re.sub(r"(?m)^frames = .*\n", "", text))
+    with pytest.raises(
+        InputError, match=r"1 frame; expected at least 4 \(tpog\.blocks\)\. Check the unit of the times"
+    ):
+        recorded_tracks.tracks_window(egvs.load(mini))
+
+
 def test_two_files_are_on_one_clock(mini: Path, run_egvs, tmp_path: Path) -> None:
     """The vehicles of one file in two files: the same frames; names that occur twice get the number of their file."""
     rows = boxes_of_fcd()
@@ -128,6 +140,7 @@ def test_recording_of_pedestrians_only(mini: Path, run_egvs, tmp_path: Path) -> 
     use_tracks(mini, interaction_csv(boxes_of_fcd()).replace(",car,", ",pedestrian,"))
     make_tpog(run_egvs, mini, tmp_path / "run")
     assert read_tpog(tmp_path / "run" / "tpog.parquet").counts.any()
+    assert RunRecord.read(tmp_path / "run").stages["tpog"].summary["with_people"]
 
 
 def test_drops_boxes_outside_coverage(mini: Path, run_egvs, tmp_path: Path) -> None:
@@ -181,7 +194,15 @@ def test_position_and_heading_are_converted_from_another_grid(tmp_path: Path) ->
     ("change", "message"),
     [
         (lambda folder: (folder / "tracks.csv").unlink(), "tracks.csv"),
-        (lambda folder: (folder / "tracks.csv").write_text("a,b\n1,2\n"), "the format of the tracks is unknown"),
+        (lambda folder: (folder / "tracks.csv").write_text("a,b\n1,2\n"), "the format of the tracks is unknown. "),
+        (
+            lambda folder: (folder / "tracks.csv").write_text("track_id,timestamp_ms,y,agent_type\n1,2,3,car\n"),
+            "is unknown; nearest to INTERACTION or TAF-BW tracks, without x. ",
+        ),
+        (
+            lambda folder: (folder / "tracks.csv").write_text("Track_ID,timestamp_ms,y,x\n1,2,3,4\n"),
+            "is unknown; nearest to INTERACTION or TAF-BW tracks, without agent_type. ",
+        ),
         (lambda folder: (folder / "tracks.csv").write_text(interaction_csv([]).strip()), "contains no rows"),
         (
             lambda folder: (folder / "tracks.csv").write_text(interaction_csv([("a", 0.0, 1.0, math.nan, 0.0)])),
@@ -190,6 +211,12 @@ def test_position_and_heading_are_converted_from_another_grid(tmp_path: Path) ->
         (
             lambda folder: (folder / "tracks.csv").write_text(interaction_csv([("a", 0.0, 1.0, 1.0, 0.0)])),
             "last 0 s, 1 frame",
+        ),
+        (
+            lambda folder: (folder / "tracks.csv").write_text(
+                interaction_csv([(name, time_s / 1000, *rest) for name, time_s, *rest in boxes_of_fcd()])
+            ),
+            "last 0.019 s, 1 frame after 0 s. Check the unit of the times: seconds in a column of milliseconds",
         ),
         (
             lambda folder: (folder / "tracks.csv").write_text(
@@ -204,7 +231,18 @@ def test_position_and_heading_are_converted_from_another_grid(tmp_path: Path) ->
             "tracks.csv",
         ),
     ],
-    ids=["missing", "unknown format", "no rows", "NaN", "too short", "far away", "truncated"],
+    ids=[
+        "missing",
+        "unknown format",
+        "without x",
+        "without agent_type",
+        "no rows",
+        "NaN",
+        "too short",
+        "seconds",
+        "far away",
+        "truncated",
+    ],
 )
 def test_wrong_tracks_are_reported(mini: Path, run_egvs, tmp_path: Path, change, message: str) -> None:
     use_tracks(mini, interaction_csv(boxes_of_fcd()))

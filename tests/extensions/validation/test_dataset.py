@@ -299,8 +299,17 @@ def test_long_vehicles_without_class_are_no_cars(four_sites, tmp_path, run_egvs)
 def test_python_function_writes_the_files_of_the_command(four_sites, tmp_path, run_egvs):
     words = ("--site", "level", "--frames", "2", "--format", "ply")
     assert run_egvs("clouds", four_sites, "--out", tmp_path / "one", *words)[0] == 0
-    other = write_clouds(load(four_sites), str(tmp_path / "other"), sites=["level"], frames=2, kind="ply")
+    other = write_clouds(load(four_sites), str(tmp_path / "other"), sites=["level"], frames=2, format="ply")
     for path in (tmp_path / "one").rglob("*.*"):
         assert (other / path.relative_to(tmp_path / "one")).read_bytes() == path.read_bytes()
     with pytest.raises(InputError, match="is not empty"):
         write_clouds(load(four_sites), other, frames=2)
+
+
+def test_python_function_refuses_no_frames_and_one_text(four_sites, tmp_path):
+    scenario = load(four_sites)
+    with pytest.raises(InputError, match=r"^frames: expected at least 1, got 0"):
+        write_clouds(scenario, tmp_path / "none", frames=0)
+    with pytest.raises(InputError, match=r"^sites: expected a list of texts, got 'level'\. Write .*sites=\['level'\]"):
+        write_clouds(scenario, tmp_path / "none", frames=1, sites="level")
+    assert not (tmp_path / "none").exists()

@@ -104,7 +104,7 @@ def test_skips_voxel_sizes_that_do_not_fit(computed, tmp_path):
 
 
 def test_rejects_unknown_score(computed, tmp_path):
-    with pytest.raises(InputError, match=r"unknown score 'egsv'. Use one of egvs, entropy_seen"):
+    with pytest.raises(InputError, match=r"unknown score 'egsv'. Choose one of egvs, "):
         compute_surrogates(computed[0], tmp_path, ["egsv"])
 
 

@@ -322,7 +322,7 @@ def print_plan(placed: CityPlacement) -> None:
         Column("junction", lambda sensor: sensor.junction, "left"),
         Column("site", lambda sensor: sensor.site, "left"),
         Column("z m", lambda sensor: f"{sensor.z_m:g}"),
-        Column("yaw deg", lambda sensor: f"{sensor.yaw_deg:.1f}"),
+        Column("ccw yaw deg", lambda sensor: f"{sensor.yaw_deg:.1f}"),
         Column("pitch deg", lambda sensor: f"{sensor.pitch_deg:.1f}"),
         Column("sensor", lambda sensor: sensor.sensor, "left"),
         Column("gain", lambda sensor: label.value(sensor.gain)),

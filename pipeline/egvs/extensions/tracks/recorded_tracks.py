@@ -50,6 +50,8 @@ MAX_FRAMES = 5_000_000
 MOTOR_CLASSES = frozenset(("car", "van", "truck", "bus"))
 """Classes that should be on lanes for cars."""
 
+_UNIT_HINT = "Check the unit of the times: seconds in a column of milliseconds give this."
+
 _SIZE_DIGITS = 2
 """Sizes are rounded to centimetres, so that tracks of one size share a vehicle type."""
 
@@ -350,6 +352,18 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
         yield from recorded.coverage.warnings(where)
 
 
+def warn_without_vehicles(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]:
+    """Warn that replayed tracks have nobody but people on foot and on bicycles, which scores do not count."""
+    classes = set(recorded.tracks.classes)
+    if classes <= cleaning.VULNERABLE:
+        problem = f"the tracks have no vehicle, only classes {' and '.join(sorted(classes))}, which scores leave out"
+        hint = (
+            "Put them beside simulated vehicles (egvs new --pedestrian-tracks), or give them a weight in"
+            " [score.weights.kinds]."
+        )
+        yield Diagnostic("no vehicles", where, problem, hint)
+
+
 def track_source(scenario: Scenario) -> TrackSource:
     """Return the files of a scenario's tracks, or else of its recorded pedestrians, and how to read them.
 
@@ -439,10 +453,16 @@ def _window(scenario: Scenario, tracks: Tracks) -> FrameWindow:
         times = f"from {finite_s.min():g} s to {finite_s.max():g} s"
         problem = f"the tracks last {times}, which are more than {MAX_FRAMES:,} frames"
         raise InputError(f"{where}.frame_period_s", problem, "Check the times, or set a longer frame_period_s.")
+    blocks = scenario.tpog.blocks
+    if traffic.tracks is not None and traffic.frames is None and 0 < count < blocks:
+        problem = f"{', '.join(traffic.tracks)} last {duration_ms / 1000:g} s, {number_of(count, 'frame')}"
+        hint = f"{_UNIT_HINT} Or use a longer recording, a shorter frame_period_s, or fewer tpog.blocks."
+        raise InputError(f"{where}.tracks", f"{problem}; expected at least {blocks} (tpog.blocks)", hint)
     if count < 1 or count > available:
         names = ", ".join(traffic.tracks or traffic.pedestrian_tracks or ())
         problem = (
             f"{names} last {duration_ms / 1000:g} s, {number_of(max(available, 0), 'frame')} after {skip_ms / 1000:g} s"
         )
-        raise InputError(f"{where}.frames", problem, "Use fewer frames, or a shorter frame_period_s or warmup_s.")
+        hint = "Use fewer frames, or a shorter frame_period_s or warmup_s."
+        raise InputError(f"{where}.frames", problem, _UNIT_HINT if 0 < duration_ms < 1000 else hint)
     return FrameWindow(count, period_ms, 0, skip_ms, complete=True)

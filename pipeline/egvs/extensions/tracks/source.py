@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS
+from egvs.core.errors import Diagnostic, InputError
 from egvs.extensions.tracks import recorded_tracks
+from egvs.extensions.tracks.recorded_tracks import RecordedTracks
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
+from egvs.scenario.score_config import is_vehicle_score
 from egvs.traffic import sumo_folder, traffic_sources
 from egvs.traffic.traffic_sources import PEDESTRIAN_TRACKS, TRACKS, RecordedTraffic
 
@@ -45,7 +50,10 @@ class TrackTrafficSource:
         if scenario.traffic.tracks is not None:
             first_ms = 0
             recorded = recorded_tracks.read_recorded_tracks(scenario, world)
-            warnings = tuple(recorded_tracks.track_warnings(recorded, where))
+            warnings = (
+                *recorded_tracks.track_warnings(recorded, where),
+                *_check_vehicles(scenario, recorded, where),
+            )
         else:
             recorded = recorded_tracks.read_recorded_pedestrians(scenario, world)
             first_ms = _first_frame_ms(scenario)
@@ -69,6 +77,16 @@ class TrackTrafficSource:
         """Return the recordings of a new scenario; InputError where a file does not exist or is of no known format."""
         new: NewTraffic = importlib.import_module(_NEW).NewTracks.find(options)
         return new
+
+
+def _check_vehicles(scenario: Scenario, recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]:
+    """Warn that tracks have no vehicle; InputError if then no score can rank the sites."""
+    if NON_VEHICLE_KINDS & set(scenario.score.weights.kinds):
+        return
+    for warning in recorded_tracks.warn_without_vehicles(recorded, where):
+        if is_vehicle_score(scenario.score.rank_by) and not scenario.period:
+            raise InputError(where, warning.problem, warning.hint)
+        yield warning
 
 
 def _key(scenario: Scenario) -> str:

@@ -12,12 +12,15 @@ import numpy as np
 from egvs.core import readers
 from egvs.core.errors import InputError
 from egvs.core.reading import translate_errors
-from egvs.extensions.tracks import user_table
+from egvs.extensions.tracks import columns, user_table
 from egvs.extensions.tracks.model import TrackReader, Tracks
 from egvs.scenario.track_columns import TrackColumns
 
 KIND = "tracks"
 """Kind of the readers of tracks."""
+
+MIN_NEAREST_SHARE = 0.5
+"""A file with a larger share of the columns of a format is probably meant to be of it."""
 
 
 def find_reader(path: Path) -> TrackReader:
@@ -32,8 +35,22 @@ def find_reader(path: Path) -> TrackReader:
     """
     reader = _find(path)
     if reader is None:
-        raise InputError(path, "the format of the tracks is unknown", _format_hint())
+        raise InputError(path, f"the format of the tracks is unknown{_describe_nearest(path)}", _format_hint())
     return reader
+
+
+def _describe_nearest(path: Path) -> str:
+    """Return which format's table a file resembles, and the columns that it lacks; empty if it resembles none."""
+    names = set(columns.header(readers.read_head(path)))
+    nearest = ""
+    best_share = MIN_NEAREST_SHARE
+    for reader in readers.list_readers(KIND):
+        required: tuple[str, ...] = getattr(readers.load_reader(reader), "REQUIRED_COLUMNS", ())
+        missing = [name for name in required if name.lower() not in names]
+        share = 1.0 - len(missing) / max(len(required), 1)
+        if required and missing and share > best_share:
+            nearest, best_share = f"; nearest to {reader.name}, without {', '.join(missing)}", share
+    return nearest
 
 
 def can_read(path: Path) -> bool:

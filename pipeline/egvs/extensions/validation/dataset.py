@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from egvs._version import __version__
-from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS
 from egvs.clouds import simulation as cloud_simulation
 from egvs.clouds.simulation import CloudSimulator
 from egvs.core import files

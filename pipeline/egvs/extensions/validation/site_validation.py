@@ -20,7 +20,7 @@ import numpy as np
 
 from egvs.artefacts import checksums, parquet
 from egvs.core import files, plugins
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, check_list
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.extensions.validation import detection_metrics, kitti_results, ranking_evidence, results, surrogates
@@ -82,6 +82,7 @@ def validate_sites(
         of interest, or the KITTI results do not belong to these sites and frames.
     """
     plugins.require_libraries("egvs validate", "validate", "matplotlib")
+    check_list("detectors", detectors)
     out = Path(out)
     chosen = {name: base.make_detector(name) for name in dict.fromkeys(detectors) if name != POINT_COUNTS_NAME}
     _check_no_input_overwritten(scenario, out, kitti)

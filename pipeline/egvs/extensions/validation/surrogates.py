@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from egvs.artefacts import parquet
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
-from egvs.core.errors import Diagnostic, InputError, MissingBackendError, RunError
+from egvs.core.errors import Diagnostic, EgvsError, InputError, MissingBackendError, RunError, choose_one
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
@@ -282,7 +282,7 @@ def load_score(name: str, location: str = "--score") -> SurrogateScore:
         If it cannot be imported, or is not a valid score.
     """
     if name not in score_names():
-        raise InputError(location, f"unknown score {name!r}", f"Use one of {', '.join(score_names())}.")
+        raise InputError(location, f"unknown score {name!r}", choose_one(name, score_names()))
     loaded = plugins.load_plugin(SCORES_GROUP, name)
     if isinstance(loaded, VehicleScore):
         return _surrogate_of_vehicles(load_vehicle_score(name))
@@ -640,7 +640,12 @@ def _score_site(site: str, evidence: SiteEvidence, tasks: Sequence[_ScoreTask]) 
 
         arguments = {name: value for name, value in task.parameters.items() if name not in _EVIDENCE_PARAMETERS}
         start = time.thread_time()
-        value = score.function(evidence, **arguments)
+        try:
+            value = score.function(evidence, **arguments)
+        except EgvsError:
+            raise
+        except Exception as error:  # a foreign function may do anything
+            raise RunError(f"score {score.name}: site {site}: its function raised {error!r}") from error
         seconds = time.thread_time() - start + sum(evidence_s[need] for need in score.needs)
         if not isinstance(value, float | int):
             raise RunError(f"score {score.name}: site {site}: expected a number, or NaN if undefined, got {value!r}")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from egvs.cli.console import NARROW, Column, console, print_sentences, print_table
+from egvs.core.errors import MissingBackendError
 from egvs.core.wording import format_percent, number_of
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS
 from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
@@ -16,7 +17,8 @@ from egvs.extensions.validation.detector_runs import DetectionListener
 from egvs.extensions.validation.remaining_time import RemainingTime
 from egvs.extensions.validation.results import main_measure
 from egvs.results.labels import SCORE_LABELS
-from egvs.scenario.score_config import DEFAULT_SCORE, RankingScore
+from egvs.scenario.score_config import DEFAULT_SCORE, RankingScore, is_plugin_score, plugin_scores
+from egvs.scoring.target_scores import load_vehicle_score
 
 if TYPE_CHECKING:
     from egvs.core.resource_usage import ResourceUsage
@@ -55,10 +57,22 @@ def print_scores(entries: Iterable[ScoreEntry]) -> None:
         Column("source", _format_source, "left", wrap=True),
     ]
     print_table(columns, entries, file_width=_FILE_WIDTH)
-    others = ", ".join(name for name in get_args(RankingScore) if name != DEFAULT_SCORE)
+    ranking = [name for name in (*get_args(RankingScore), *plugin_scores()) if _can_rank(name)]
+    others = ", ".join(name for name in ranking if name != DEFAULT_SCORE)
     console(_FILE_WIDTH, soft_wrap=False).print(
         f"[score] rank_by chooses the score that ranks sites: {DEFAULT_SCORE} (recommended), {others}"
     )
+
+
+def _can_rank(name: str) -> bool:
+    """Return whether a score ranks sites: one of this program, or a valid score of vehicles of another package."""
+    if not is_plugin_score(name):
+        return True
+    try:
+        load_vehicle_score(name)
+    except MissingBackendError:
+        return False
+    return True
 
 
 def _format_formula(entry: ScoreEntry) -> str:

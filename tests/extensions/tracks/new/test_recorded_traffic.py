@@ -155,6 +155,45 @@ def test_wrong_track_columns_are_reported(run_egvs, tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
+PEDESTRIANS = [f"2,{k},{100 * k},pedestrian,{0.1 * k:.3f},5.0,1,0,,," for k in range(101)]
+
+
+def test_tracks_without_vehicles_are_reported(run_egvs, tmp_path: Path) -> None:
+    """By a warning when the scenario is made, and as an error before anything is scanned."""
+    road_map, new = write_crossing(tmp_path / "map.osm"), tmp_path / "new"
+    (tmp_path / "people.csv").write_text("\n".join([HEADER, *PEDESTRIANS, ""]), encoding="utf-8")
+    lat_deg, lon_deg = degrees((0.0, 0.0))
+    (tmp_path / "meta_data.csv").write_text(f"id,originLat,originLon\n000,{lat_deg},{lon_deg}\n")
+    code, out, err = run_egvs("new", new, "--from", road_map, "--tracks", tmp_path / "people.csv")
+    told = " ".join((out + err).split())
+    assert code == 0 and "the tracks have no vehicle, only classes pedestrian" in told
+    code, out, err = run_egvs("check", new)
+    told = " ".join((out + err).split())
+    assert code == 2 and "--pedestrian-tracks" in told and "[score.weights.kinds]" in told
+    code, out, err = run_egvs("check", new, "--set", "score.weights.kinds.pedestrian=1")
+    assert "the tracks have no vehicle" not in " ".join((out + err).split())
+
+
+def test_misplaced_tracks_are_reported(run_egvs, tmp_path: Path) -> None:
+    """The car drives 8 m beside High Street."""
+    road_map = write_crossing(tmp_path / "map.osm")
+    at_m = create_scenario(tmp_path / "first", road_map).junction.at_m
+    tracks = write_tracks(tmp_path / "tracks.csv", x_m=at_m[0] - 50.0, y_m=at_m[1] - 9.6)
+    options = ["--tracks", tracks, "--track-crs", "world"]
+    code, out, err = run_egvs("new", tmp_path / "new", "--from", road_map, *options)
+    told = " ".join((out + err).split())
+    assert code == 0 and "Check the coordinate system (traffic.track_crs)" in told
+
+
+def test_errors_of_tracks_name_options(run_egvs, tmp_path: Path) -> None:
+    road_map, tracks = write_crossing(tmp_path / "map.osm"), write_tracks(tmp_path / "tracks.csv", x_m=9e5)
+    far = run_egvs("new", tmp_path / "new", "--from", road_map, "--tracks", tracks)
+    assert far[0] == 2 and "--track-crs" in far[2] and "traffic.track_crs" not in far[2]
+    tracks.write_text("a,b\n1,2\n")
+    unknown = run_egvs("new", tmp_path / "new", "--from", road_map, "--tracks", tracks)
+    assert unknown[0] == 2 and "in a TOML file, --track-columns FILE" in " ".join(unknown[2].split())
+
+
 def test_two_statements_of_the_system_are_an_error(run_egvs, tmp_path: Path) -> None:
     road_map, tracks = write_crossing(tmp_path / "map.osm"), write_tracks(tmp_path / "tracks.csv")
     columns = tmp_path / "columns.toml"

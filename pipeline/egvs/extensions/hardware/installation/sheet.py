@@ -398,7 +398,7 @@ def draw_sheet(planned: PlannedSites, data: SheetData) -> str:
     map_width = inner - column - 0.04 * inner
     parts.append(f'<g transform="translate({map_left:.1f} 140)">{_draw_map(planned, data, map_width)}</g>')
     legend = f"Orange: the sensor, its field of view{_describe_radius(data)} and its front (arrow)"
-    parts.append(_text(map_left, 536, legend, 11, colour="#4a5262"))
+    parts.append(_text(map_left, 568, legend, 11, colour="#4a5262"))
 
     top = max(below, 560.0) + 30
     picture_height = inner / 2.0

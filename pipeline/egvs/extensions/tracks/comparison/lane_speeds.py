@@ -22,7 +22,7 @@ import numpy as np
 import pyarrow.compute as pc
 
 from egvs.artefacts import traffic_frames
-from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
+from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.extensions.tracks.comparison.lane_bins import LaneBins
 from egvs.scoring.standard_errors import BlockGroups

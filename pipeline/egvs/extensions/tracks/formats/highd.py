@@ -18,14 +18,14 @@ from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.formats import levelx
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 
-_REQUIRED = ("frame", "id", "x", "y", "width", "height")
+REQUIRED_COLUMNS = ("frame", "id", "x", "y", "width", "height")
 _CLASSES = {"car": "car", "truck": "truck"}
 _YAW_RAD = {1.0: math.pi, 2.0: 0.0}
 
 
 def can_open(_path: Path, head: bytes) -> bool:
     """Return whether the first line names highD's columns."""
-    return columns.has_columns(head, *_REQUIRED, "xVelocity", "laneId")
+    return columns.has_columns(head, *REQUIRED_COLUMNS, "xVelocity", "laneId")
 
 
 def companions(path: Path) -> Sequence[Path]:
@@ -36,7 +36,7 @@ def companions(path: Path) -> Sequence[Path]:
 def read(path: Path) -> Tracks:
     """Read a file."""
     tracks_meta, recording_meta = companions(path)
-    table = columns.read_table(path, _REQUIRED)
+    table = columns.read_table(path, REQUIRED_COLUMNS)
     rate_hz = levelx.frame_rate_hz(levelx.read_recording(recording_meta, ("frameRate",)))
     vehicles = columns.read_table(tracks_meta, ("id", "class", "drivingDirection"))
     classes, direction = vehicles.classes("class", _CLASSES), vehicles.numbers("drivingDirection")

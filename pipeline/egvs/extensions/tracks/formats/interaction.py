@@ -25,7 +25,7 @@ from egvs.core.grid import FloatArray
 from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 
-_REQUIRED = ("track_id", "timestamp_ms", "agent_type", "x", "y")
+REQUIRED_COLUMNS = ("track_id", "timestamp_ms", "agent_type", "x", "y")
 _OPTIONAL = ("psi_rad", "length", "width", "case_id")
 _META_FILE = "meta_data.csv"
 _EARTH_RADIUS_M = 6378137.0
@@ -43,7 +43,7 @@ MAP_FRAME = TrackFrame("EPSG:32631", (166021.4430805405, 0.0))
 
 def can_open(_path: Path, head: bytes) -> bool:
     """Return whether the first line names INTERACTION's columns; SinD's have further ones."""
-    return columns.has_columns(head, *_REQUIRED) and not columns.has_columns(head, "ax", "ay")
+    return columns.has_columns(head, *REQUIRED_COLUMNS) and not columns.has_columns(head, "ax", "ay")
 
 
 def companions(path: Path) -> Sequence[Path]:
@@ -54,7 +54,7 @@ def companions(path: Path) -> Sequence[Path]:
 
 def read(path: Path) -> Tracks:
     """Read a file."""
-    table = columns.read_table(path, _REQUIRED, _OPTIONAL)
+    table = columns.read_table(path, REQUIRED_COLUMNS, _OPTIONAL)
     names, time_s = list(table.names("track_id")), table.times_s("timestamp_ms", 0.001)
     frame, sources = MAP_FRAME, []
     if "case_id" in table.columns:

@@ -19,7 +19,7 @@ from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 from egvs.formats.georeference import WorldFrame, utm_epsg
 
-_REQUIRED = ("trackId", "frame", "xCenter", "yCenter", "heading")
+REQUIRED_COLUMNS = ("trackId", "frame", "xCenter", "yCenter", "heading")
 _CLASSES = {
     "car": "car", "van": "van", "truck": "truck", "truck_bus": "truck", "bus": "bus", "trailer": "trailer",
     "tram": "tram", "motorcycle": "motorcycle", "bicycle": "bicycle", "pedestrian": "pedestrian",
@@ -30,7 +30,7 @@ _MAX_LOCATION_ERROR_M = 20_000.0
 
 def can_open(_path: Path, head: bytes) -> bool:
     """Return whether the first line names the columns of these data sets."""
-    return columns.has_columns(head, *_REQUIRED)
+    return columns.has_columns(head, *REQUIRED_COLUMNS)
 
 
 def companions(path: Path) -> Sequence[Path]:
@@ -41,7 +41,7 @@ def companions(path: Path) -> Sequence[Path]:
 def read(path: Path) -> Tracks:
     """Read a file."""
     tracks_meta, recording_meta = companions(path)
-    table = columns.read_table(path, _REQUIRED, ("length", "width"))
+    table = columns.read_table(path, REQUIRED_COLUMNS, ("length", "width"))
     recording = read_recording(recording_meta, ("frameRate", "latLocation", "lonLocation", "xUtmOrigin", "yUtmOrigin"))
     types = columns.read_table(tracks_meta, ("trackId", "class"))
     classes = types.classes("class", _CLASSES)

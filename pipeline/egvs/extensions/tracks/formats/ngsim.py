@@ -23,7 +23,7 @@ from egvs.extensions.tracks.model import TrackFrame, Tracks
 from egvs.extensions.tracks.motion import motion_yaw_rad
 
 FOOT_M = 0.3048
-_REQUIRED = ("Vehicle_ID", "Global_Time", "Local_X", "Local_Y", "v_Length", "v_Width", "v_Class")
+REQUIRED_COLUMNS = ("Vehicle_ID", "Global_Time", "Local_X", "Local_Y", "v_Length", "v_Width", "v_Class")
 _CLASSES = {"1": "motorcycle", "2": "car", "3": "truck"}
 _REUSED_AFTER_S = 10.0
 _MOTION_STEP_M = 2.0
@@ -31,7 +31,7 @@ _MOTION_STEP_M = 2.0
 
 def can_open(_path: Path, head: bytes) -> bool:
     """Return whether the first line names NGSIM's columns."""
-    return columns.has_columns(head, *_REQUIRED)
+    return columns.has_columns(head, *REQUIRED_COLUMNS)
 
 
 def companions(_path: Path) -> Sequence[Path]:
@@ -41,7 +41,7 @@ def companions(_path: Path) -> Sequence[Path]:
 
 def read(path: Path) -> Tracks:
     """Read a file."""
-    table = columns.read_table(path, _REQUIRED, ("Location",))
+    table = columns.read_table(path, REQUIRED_COLUMNS, ("Location",))
     if len(locations := sorted(set(table.columns.get("Location", ())))) > 1:
         problem = f"expected one location, got {', '.join(locations)[:200]}"
         raise InputError(f"{path}: Location", problem, "Keep only the rows of one.")

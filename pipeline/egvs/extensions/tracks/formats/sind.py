@@ -14,7 +14,7 @@ from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.formats.interaction import MAP_FRAME
 from egvs.extensions.tracks.model import Tracks
 
-_REQUIRED = ("track_id", "timestamp_ms", "agent_type", "x", "y")
+REQUIRED_COLUMNS = ("track_id", "timestamp_ms", "agent_type", "x", "y")
 _FURTHER = ("ax", "ay")
 _CLASSES = {
     "car": "car", "bus": "bus", "truck": "truck", "motorcycle": "motorcycle", "bicycle": "bicycle",
@@ -24,7 +24,7 @@ _CLASSES = {
 
 def can_open(_path: Path, head: bytes) -> bool:
     """Return whether the first line names SinD's columns: INTERACTION's, and accelerations."""
-    return columns.has_columns(head, *_REQUIRED, *_FURTHER)
+    return columns.has_columns(head, *REQUIRED_COLUMNS, *_FURTHER)
 
 
 def companions(_path: Path) -> Sequence[Path]:
@@ -34,7 +34,7 @@ def companions(_path: Path) -> Sequence[Path]:
 
 def read(path: Path) -> Tracks:
     """Read a file."""
-    table = columns.read_table(path, _REQUIRED, ("yaw_rad", "length", "width"))
+    table = columns.read_table(path, REQUIRED_COLUMNS, ("yaw_rad", "length", "width"))
     values = {
         "time_s": table.times_s("timestamp_ms", 0.001),
         "x_m": table.positions_m("x"),

@@ -17,7 +17,7 @@ from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.boxes import ClassNames, make_tracks
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 
-_REQUIRED = ("timestamp", "id", "type", "sub_type", "x", "y", "theta")
+REQUIRED_COLUMNS = ("timestamp", "id", "type", "sub_type", "x", "y", "theta")
 _OPTIONAL = ("z", "length", "width", "height")
 
 _CLASSES = {
@@ -30,7 +30,7 @@ _STATIC = frozenset({"trafficcone", "unknownunmovable"})
 
 def can_open(_path: Path, head: bytes) -> bool:
     """Return whether the first line names the data set's columns."""
-    return columns.has_columns(head, *_REQUIRED, "tag", "intersect_id")
+    return columns.has_columns(head, *REQUIRED_COLUMNS, "tag", "intersect_id")
 
 
 def companions(_path: Path) -> Sequence[Path]:
@@ -40,7 +40,7 @@ def companions(_path: Path) -> Sequence[Path]:
 
 def read(path: Path) -> Tracks:
     """Read a file."""
-    table = columns.read_table(path, _REQUIRED, _OPTIONAL)
+    table = columns.read_table(path, REQUIRED_COLUMNS, _OPTIONAL)
     types = ClassNames(_CLASSES, _STATIC)
     pairs = zip(table.texts("sub_type"), table.texts("type"), strict=True)
     classes = [types.convert(sub_type or kind) for sub_type, kind in pairs]

@@ -127,7 +127,8 @@ class TrackFiles:
         frames = min(int((last_s - first_s) / period_s + 1e-6) + 1, DEFAULT_FRAMES)
         if frames < _BLOCKS:
             problem = f"expected at least {_BLOCKS} frames of {period_s:g} s, got {max(frames, 0)}"
-            raise InputError(self.source.paths[0], problem, "Use a longer recording of people and signals.")
+            hint = "Check the unit of the times, or use a longer recording of people and signals."
+            raise InputError(self.source.paths[0], problem, hint)
         frames -= frames % _BLOCKS
         return self._source_keys("pedestrian_tracks", {"frames": frames, "frame_period_s": period_s})
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from egvs.extensions.tracks.new.files import TrackFiles
 from egvs.extensions.tracks.new.motion import MatchedRecording, match_recording
 from egvs.extensions.tracks.new.signal_assignment import RecordedMotion
 from egvs.extensions.tracks.new.signal_programs import RecordedSignalNetwork, Replay
-from egvs.extensions.tracks.recorded_tracks import RecordedTracks, track_warnings
+from egvs.extensions.tracks.recorded_tracks import RecordedTracks, track_warnings, warn_without_vehicles
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import DEFAULT_WARMUP_S
 
@@ -26,6 +27,13 @@ _SIGNALS_OF_TRACKS_NOTE = (
     "Recorded traffic does not depend on the signals. They are tested against it, and network.net.xml replays them on"
     " its clock; with --like instead of --tracks, simulated traffic obeys them."
 )
+
+
+OPTION_OF_KEY = {
+    "in [traffic.track_columns]": "in a TOML file, --track-columns FILE",
+    "traffic.track_crs": "--track-crs",
+}
+"""How hints name keys of scenarios, and the options of ``egvs new`` that set them."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +51,11 @@ class ReplayedVehicles:
 
     def warnings(self, scenario_file: Path) -> Iterator[str]:
         """Yield what is doubtful about the tracks."""
-        for warning in track_warnings(self.recorded, f"{scenario_file}: traffic.tracks"):
-            yield str(warning)
+        where = f"{scenario_file}: traffic.tracks"
+        yield from map(str, track_warnings(self.recorded, where))
+        yield from map(str, warn_without_vehicles(self.recorded, where))
+        if self.recorded.alignment is not None:
+            yield from map(str, self.recorded.alignment.warnings(where))
 
     def add_keys(self, table: Any, streets: Streets, junction: StreetJunction) -> None:
         """Add nothing: the keys name files, see :meth:`TrackFiles.traffic_table`."""
@@ -70,12 +81,13 @@ class NewTracks:
     @classmethod
     def find(cls, options: RecordingOptions) -> NewTracks:
         """Return the recordings; InputError where a file does not exist or is of no known format."""
-        return cls(
-            _find_tracks(options.tracks, options),
-            _find_tracks(options.like, options),
-            _find_tracks(options.pedestrian_tracks, options),
-            options.signals,
-        )
+        with _option_names():
+            return cls(
+                _find_tracks(options.tracks, options),
+                _find_tracks(options.like, options),
+                _find_tracks(options.pedestrian_tracks, options),
+                options.signals,
+            )
 
     @property
     def _tracks(self) -> list[TrackFiles]:
@@ -88,7 +100,8 @@ class NewTracks:
 
     def middle_m(self, streets: Streets) -> XY:
         """Return the median position of the tracks in the world frame; InputError where they are far from the map."""
-        return self._tracks[0].middle_m(streets)
+        with _option_names():
+            return self._tracks[0].middle_m(streets)
 
     def plan(self, network: str, streets: Streets, junction: StreetJunction) -> RecordingPlan:
         """Return what the recordings give to the scenario of a junction.
@@ -105,7 +118,8 @@ class NewTracks:
         InputError
             When tracks are damaged or far from the streets, no vehicle passes the junction, or signals do not fit it.
         """
-        matched = [match_recording(tracks, streets) for tracks in self._tracks]
+        with _option_names():
+            matched = [match_recording(tracks, streets) for tracks in self._tracks]
         signalled = RecordedSignalNetwork(network, ())
         notes: list[str] = []
         if self.signals:
@@ -154,6 +168,18 @@ class NewTracks:
             if tracks is not None:
                 copies |= tracks.copies()
         return copies
+
+
+@contextmanager
+def _option_names() -> Iterator[None]:
+    """Let hints of errors name options of ``egvs new`` instead of keys: there is no scenario yet."""
+    try:
+        yield
+    except InputError as error:
+        hint = error.hint
+        for key, option in OPTION_OF_KEY.items():
+            hint = hint.replace(key, option)
+        raise InputError(error.where, error.problem, hint) from None
 
 
 def _find_tracks(paths: Sequence[Path], options: RecordingOptions) -> TrackFiles | None:
