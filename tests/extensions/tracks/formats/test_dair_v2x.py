@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -183,6 +184,10 @@ def test_damaged_companions(tmp_path: Path) -> None:
         dair_v2x.read(path)
     calibrate(tmp_path, 1, translation=[1, 2])
     with pytest.raises(InputError, match=r"000001\.json: translation: expected 3 numbers, got 2"):
+        dair_v2x.read(path)
+    index = (tmp_path / "data_info.json").read_text()
+    (tmp_path / "data_info.json").write_text(re.sub(r'("pointcloud_timestamp": )[^,}]*', r"\g<1>1e40", index, count=1))
+    with pytest.raises(InputError, match=r"data_info\.json: .*pointcloud_timestamp: expected microseconds"):
         dair_v2x.read(path)
     (tmp_path / "data_info.json").write_text("[]")
     with pytest.raises(InputError, match=r"is not listed in data_info\.json"):

@@ -24,6 +24,7 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.core.wording import number_of
 from egvs.extensions.tracks.boxes import Box, BoxRows, ClassNames, Pose, is_rotation
+from egvs.extensions.tracks.columns import MAX_TIME_S
 from egvs.extensions.tracks.formats.documents import Node, read_document
 from egvs.extensions.tracks.model import TrackFrame, Tracks
 from egvs.formats.sweep_labels import LabelOptions, SweepLabels, scores_or_none, sweep_name
@@ -160,7 +161,10 @@ def _sweeps(path: Path) -> list[_Sweep]:
     sweeps = []
     for sequence, entry, name in entries:
         if sequence == names[0]:
-            time_s = entry.get("pointcloud_timestamp").number() / 1e6
+            timestamp = entry.get("pointcloud_timestamp")
+            time_s = timestamp.number() / 1e6
+            if abs(time_s) > MAX_TIME_S:
+                raise timestamp.error(f"expected microseconds up to {1e6 * MAX_TIME_S:g}")
             sweeps.append(_Sweep(time_s, name, labels.get(name), calibrations.get(name)))
     return sorted(sweeps, key=lambda sweep: (sweep.time_s, sweep.name))
 
