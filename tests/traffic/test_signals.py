@@ -354,7 +354,7 @@ def test_german_table_gives_the_same_program(crossing, tmp_path):
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all,often"), "line 4: green_s: expected seconds, got 'often'"),
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all"), "line 4: expected 4 values, got 3"),
         ("p.csv", CSV.replace("green_s", "green_s,colour").replace("0\n", "0,red\n"), "unknown column 'colour'"),
-        ("p.csv", CSV.replace("movement", "movment").replace("approach", "Ort"), "unknown columns 'Ort', 'movment'"),
+        ("p.csv", CSV.replace("movement", "turns").replace("approach", "Ort"), "unknown columns 'Ort', 'turns'"),
         *(
             ("p.add.xml", f'<additional><tlLogic id="c"><phase duration="{text}" state="GG"/></tlLogic></additional>',
              f"invalid <tlLogic> (ValueError(\"duration = '{text}': expected seconds, above 0\"))")
