@@ -74,7 +74,7 @@ def finer_tilts(best_deg: float, tried_deg: tuple[float, ...]) -> str:
 
 
 def test_hints_at_finer_tilts_where_the_best_one_is_at_the_edge_or_between_coarse_ones() -> None:
-    command = ["Finer", "tilts:", "egvs", "sensor", "design", "my run", "--pole", "Ampel Nord"]
+    command = ["Finer", "tilts:", "egvs", "place", "my run", "--count", "1", "--refine"]
     for best_deg, tried_deg in ((0.0, (0.0, -5.0, -10.0)), (-10.0, (0.0, -5.0, -10.0)), (-10.0, (0.0, -10.0, -20.0))):
         assert shlex.split(finer_tilts(best_deg, tried_deg)) == command
     assert finer_tilts(-5.0, (0.0, -5.0, -10.0)) == ""

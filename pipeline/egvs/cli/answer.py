@@ -6,7 +6,6 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -140,11 +139,11 @@ def _finer_tilts(folder: RunFolder, ranked: Ranking) -> str:
     on_pole = next(pole for pole in ranked.poles if pole.name == best.pole).sites
     others = [site.pitch_deg - best.pitch_deg for site in on_pole if site.sensor == best.sensor]
     steeper, flatter = [-step for step in others if step < 0], [step for step in others if step > 0]
-    if not (steeper or flatter) or find_spec("egvs.extensions.hardware") is None:
+    if not (steeper or flatter):
         return ""
     if steeper and flatter and max(min(steeper), min(flatter)) <= _TILT_STEP_DEG:
         return ""
-    return f"Finer tilts: {shlex.join(['egvs', 'sensor', 'design', str(folder.path), '--pole', best.pole])}"
+    return f"Finer tilts: {shlex.join(['egvs', 'place', str(folder.path), '--count', '1', '--refine'])}"
 
 
 def _worst_location(folder: RunFolder, best: RankedSite) -> str:
