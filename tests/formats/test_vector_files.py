@@ -273,3 +273,13 @@ def test_geometry_columns_of_geoparquet_are_left_out(tmp_path: Path) -> None:
     document = vector_files.read_gis_file(path, "Point")
     assert set(document["features"][0]["properties"]) == set(ROWS)
     assert json.loads(document["crs"]["properties"]["name"])["id"]["code"] == 4326
+
+
+def test_geometries_of_geoparquet_are_bytes(tmp_path: Path) -> None:
+    path = write(tmp_path / "poles.parquet", frame_of(ROWS))
+    table = pq.read_table(path)
+    lists = pa.array([[value] for value in table["geometry"].to_pylist()], pa.list_(pa.binary()))
+    column = table.schema.get_field_index("geometry")
+    pq.write_table(table.set_column(column, "geometry", lists).replace_schema_metadata(table.schema.metadata), path)
+    with pytest.raises(InputError, match=r"encoded as WKB, got values of type list<.*Export it again"):
+        vector_files.read_gis_file(path, "Point")

@@ -168,7 +168,12 @@ def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
     doing = "the file cannot be read as GeoParquet"
     with parquet_process.open_parquet(path, doing) as (header, batches):
         name, crs = _geometry_column(path, header, doing)
-        return _bounded_table(path, batches), name, crs
+        table = _bounded_table(path, batches)
+    kind = table.schema.field(name).type
+    if not (pa.types.is_binary(kind) or pa.types.is_large_binary(kind)):
+        problem = f"expected a geometry column {name!r} encoded as WKB, got values of type {kind}"
+        raise InputError(path, problem, "Export it again with the encoding WKB.")
+    return table, name, crs
 
 
 def _geometry_column(path: Path, header: parquet_process.ParquetHeader, doing: str) -> tuple[str, str | None]:
