@@ -35,8 +35,8 @@ def test_no_value_in_a_command_is_unquoted() -> None:
     for path in PACKAGE.rglob("*.py"):
         if lines := unquoted_commands(path.read_text(encoding="utf-8")):
             found[path.name] = lines
-    assert found.pop("design.py") == ['source=f"egvs sensor design, from {base.name}", assumed="",']  # no command
-    assert found == {}
+    no_command = ['source=f"egvs sensor design, from {base.name}", assumed="",']
+    assert found in ({}, {"design.py": no_command})  # of an extension
 
 
 def test_hints_of_demo_and_options_are_words_of_a_shell(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

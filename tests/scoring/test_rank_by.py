@@ -29,6 +29,7 @@ from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.stages import score
 from tests.core.test_plugins import clear_caches, install
+from tests.installed import needs
 from tests.scoring import target_scenes as scenes
 from tests.stage_runner import inputs_of, run_stage
 
@@ -329,6 +330,7 @@ def test_raising_score_is_one_message(mini: Path, tmp_path: Path, plugin: None, 
     assert "score raising: its function raised ZeroDivisionError('division by zero')" in error
 
 
+@needs("validation")
 def test_list_of_scores_ends_with_those_that_rank(plugin: None, run_egvs) -> None:
     code, printed, _ = run_egvs("scores")
     last = printed[printed.index("[score] rank_by chooses") :]
@@ -377,7 +379,7 @@ def test_ranks_and_plans_by_the_score_of_a_plugin(
 
 
 def test_wrong_scores_of_plugins_are_named(mini: Path, tmp_path: Path, plugin: None, run_egvs) -> None:
-    message = r"score\.rank_by: expected one of egvs, .*my_score, of_sites, wrong, got 'my_scor'"
+    message = r"score\.rank_by: expected one of egvs, .*my_score, .*wrong, got 'my_scor'; did you mean 'my_score'"
     with pytest.raises(InputError, match=message):
         loading.load(mini, ["score.rank_by=my_scor"])
     with pytest.raises(
