@@ -473,7 +473,7 @@ def test_run_records_and_shows_warnings(mini: Path, run_egvs) -> None:
         assert (code, state in said, "warning: statics: the nearest solid is 2,209 m" in said) == (0, True, True)
     record = json.loads((mini / "out" / "run.json").read_text())
     assert [warning["rule"] for warning in record["stages"]["check"]["summary"]["warnings"]] == ["statics far away"]
-    assert "the nearest solid is 2,209 m" in (mini / "out" / "report.html").read_text()
+    assert "the nearest solid is 2,209\u00a0m" in (mini / "out" / "report.html").read_text()
     assert run_egvs("verify", mini / "out")[0] == 0
 
 

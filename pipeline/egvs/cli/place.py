@@ -418,7 +418,7 @@ def describe_refinement(placed: SensorPlan, summary: RefinementSummary) -> str:
         f"Refined: {by.noun} {by.value(summary.joint_before)} before, {by.with_unit(placed.joint, placed.joint_se)} "
         f"after{objective}{cost}; "
         f"{summary.poses_tried} poses tried in {summary.turns} rounds and {summary.seconds:.1f} s, "
-        f"{summary.poses_infeasible} of them infeasible."
+        f"{summary.poses_infeasible} of them infeasible; the proof applies to the poses before."
     )
 
 

@@ -276,7 +276,7 @@ def _read_text(path: Path, data: bytes) -> _Table:
         header = lines[0] if lines else ""
         separator = max(_SEPARATORS, key=header.count)
         names = next((line for line in lines[1:_MAX_ABOVE] if any(map(line.count, _SEPARATORS))), "")
-        if separator not in names:  # the first line is a title, in which there may be a comma
+        if names and separator not in names:  # the first line is a title, in which there may be a comma
             separator = max(_SEPARATORS, key=names.count)
         if "|" in header and not header.count(separator):
             raise InputError(path, "the columns are separated by '|'", "Use commas or semicolons.")

@@ -170,6 +170,8 @@ def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
         name, crs = _geometry_column(path, header, doing)
         table = _bounded_table(path, batches)
     kind = table.schema.field(name).type
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
     if not (pa.types.is_binary(kind) or pa.types.is_large_binary(kind)):
         problem = f"expected a geometry column {name!r} encoded as WKB, got values of type {kind}"
         raise InputError(path, problem, "Export it again with the encoding WKB.")

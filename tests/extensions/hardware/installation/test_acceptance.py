@@ -436,7 +436,7 @@ def test_rejects_limit_that_is_no_number(run_egvs: Any, tmp_path: Path, option: 
 def test_rejects_unknown_site_and_missing_options(installed: InstalledRun, run_egvs: Any) -> None:
     scan = installed.write("good.ply", installed.points())
     for words, message in (
-        (("--site", "pole_x", "--scan", scan), "no site 'pole_x'. Choose one of pole_a, pole_b."),
+        (("--site", "pole_x", "--scan", scan), "no pole or site 'pole_x'. Choose one of pole_a, pole_b."),
         (("--scan", scan), "--site: no site is given"),
         (("--site", "pole_a"), "--scan: no scan is given"),
         (("--site", "pole_a", "--scan", scan.with_name("none.pcd")), "none.pcd"),
