@@ -31,7 +31,8 @@ main()
 def shell(line: str) -> subprocess.CompletedProcess[str]:
     """A line of the shell with ``egvs`` in it."""
     words = line.replace("egvs", f"'{sys.executable}' -c '{EGVS}'", 1)
-    return subprocess.run(["bash", "-c", f"set -o pipefail; {words}"], capture_output=True, text=True)
+    line = f"set -o pipefail; unset PYTHONUNBUFFERED; {words}"
+    return subprocess.run(["bash", "-c", line], capture_output=True, text=True)
 
 
 @pytest.mark.slow
@@ -59,7 +60,7 @@ def test_names_that_an_encoding_does_not_know_are_printed_as_escapes(mini: Path,
 def test_full_streams_are_reported_and_closed_ones_are_not() -> None:
     full = shell("egvs sensors > /dev/full")
     told = "egvs: standard output, or a file: No space left on device"
-    assert (full.returncode, full.stderr.split(" (")[0]) == (1, told)
+    assert (full.returncode, full.stderr.split(" (")[0], len(full.stderr.splitlines())) == (1, told, 1)
     short = shell("egvs --help > /dev/full")
     assert (short.returncode, len(short.stderr.splitlines())) == (1, 1), short.stderr
     unread = shell("egvs effects | true")

@@ -61,6 +61,10 @@ def report_errors() -> Iterator[None]:
         _discard_stream(sys.stdout)
         sys.exit(_FAILED)
     except OSError as error:
+        try:
+            sys.stdout.flush()
+        except OSError:
+            _discard_stream(sys.stdout)
         _fail(*describe_os_error(error))
     except UnicodeEncodeError as error:
         if error.reason != SURROGATES:
