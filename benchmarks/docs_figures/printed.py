@@ -35,6 +35,8 @@ SCORES = PRINTED / "scores.json"
 
 
 _TIMES = re.compile(r"^(\w[\w ]*?) +(?:[\d.,]+ s|from store|unchanged) +", re.MULTILINE)
+_STEPS = re.compile(r"^ +[\d.,]+ s +.*\n", re.MULTILINE)
+_CACHED = re.compile(r"(?<=/overpass/)[0-9a-f]{16}(?=\.osm)")
 _SIZE = re.compile(r"^(report +)[\d,]+ [kM]B", re.MULTILINE)
 _MARK = re.compile(r"^(?: *)<!-- printed: ([\w, -]+) -->\n+", re.MULTILINE)
 _FENCE = re.compile(r" *(```+)[^\n]*\n(.*?)\n *\1", re.DOTALL)
@@ -113,13 +115,14 @@ def run_command(command: str, folder: Path, environment: dict[str, str] | None =
 
 
 def without_times(text: str) -> str:
-    """Remove the seconds of stages, and the size of the report.
+    """Remove the seconds of stages, steps in the order of time, the size of the report and names in the cache.
 
     Examples
     --------
     >>> without_times("check           3.6 s   8 sites checked\\nscan       from store   8 sites scanned")
     'check   8 sites checked\\nscan   8 sites scanned'
     """
+    text = _CACHED.sub("...", _STEPS.sub("", text))
     text = _SIZE.sub(r"\1...", _TIMES.sub(r"\1   ", text))
     return "\n".join(line.rstrip() for line in text.split("\n"))
 
