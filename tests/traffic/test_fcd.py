@@ -114,6 +114,15 @@ def test_file_that_grows_has_the_rows_of_the_complete_file(tmp_path_factory, cut
     assert pa.concat_tables(tables).to_pydict() == ROWS
 
 
+def test_finished_file_is_read_in_blocks(tmp_path, monkeypatch):
+    path = tmp_path / "fcd.csv"
+    path.write_text(CSV)
+    monkeypatch.setattr(fcd, "_BLOCK_BYTES", 60)
+    tables = list(fcd.read_growing_fcd(path, "vehicle", lambda: True))
+    assert len(tables) == 3  # one for each vehicle: memory does not grow with the file
+    assert pa.concat_tables(tables).to_pydict() == ROWS
+
+
 def test_file_that_grows_may_have_no_vehicle(tmp_path):
     growing = GrowingFile(tmp_path / "fcd.csv", b"\n", [])
     assert list(fcd.read_growing_fcd(tmp_path / "fcd.csv", "vehicle", growing.has_ended)) == []

@@ -215,10 +215,13 @@ def _read_growing_csv(path: Path, element: str, has_ended: Callable[[], bool]) -
     with path.open("rb") as file:
         is_last = False
         while not is_last:
-            is_last = has_ended()  # before reading
-            content += file.read()
+            is_complete = has_ended()  # before reading
+            block = file.read(_BLOCK_BYTES)
+            content += block
+            is_last = is_complete and not block
             if not is_last and len(content) < _BLOCK_BYTES:
-                time.sleep(_WAIT_S)
+                if not block:
+                    time.sleep(_WAIT_S)
                 continue
             lines, line_end, content = content.rpartition(b"\n")
             if not line_end:
