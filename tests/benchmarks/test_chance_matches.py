@@ -36,7 +36,7 @@ def test_groups_by_kind(kind, group):
     assert group_of(kind) == group
 
 
-def test_thinned_share_falls_with_what_is_kept():
+def test_share_of_matches_falls_with_the_number_of_boxes():
     rng = np.random.default_rng(1)
     frames = [frame_of([(x, 0, 1, 4, 2, 2, 0, 0) for x in rng.uniform(0, 60, 12)]) for _ in range(40)]
     values = [chance_shares(frames, 7, 5, (kept, 1.0))["cars"].value for kept in (1.0, 0.5, 0.1)]

@@ -56,7 +56,7 @@ def returns_of(folder, pose, sensor, *settings, seed=1):
         (2.0, "{pulse_ns=14}", 21.4252, 0.24),
     ],
 )
-def test_beam_beside_the_edge_of_a_plate(mini, gap_m, setting, range_m, intensity):
+def test_range_of_a_beam_at_the_edge_of_a_plate(mini, gap_m, setting, range_m, intensity):
     """The axis of beam 200 passes 1 mm left of the plate; three of the ring's six sub-beams, 3/12, are right of it."""
     write_plate_and_wall(mini, gap_m)
     result = returns_of(mini, Pose(0.0, 0.001, 3.0), level_beams(), f"effects.mixed_returns={setting}")

@@ -1,4 +1,4 @@
-"""A script without a main guard is told so before any worker process starts."""
+"""A script without a main guard gets an error before any worker process starts."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ from concurrent.futures import CancelledError
 
 import pytest
 
-from egvs.core.threads import at_checkpoints, checkpoint, map_ordered, run_beside
+from egvs.core.threads import at_checkpoints, checkpoint, map_ordered, run_in_thread
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -20,12 +20,12 @@ def test_first_error_ends_the_work(threads):
         list(map_ordered(lambda n: 1 // (5 - n), range(20), threads))
 
 
-def test_work_beside_a_block_gives_its_result():
-    with run_beside(lambda: 6 * 7) as future:
+def test_function_in_a_thread_returns_its_result():
+    with run_in_thread(lambda: 6 * 7) as future:
         assert future.result(timeout=60) == 42
 
 
-def test_work_beside_a_block_ends_with_the_block():
+def test_function_in_a_thread_ends_with_the_block():
     began = threading.Event()
 
     def work():
@@ -34,7 +34,7 @@ def test_work_beside_a_block_ends_with_the_block():
             checkpoint()
             time.sleep(0.001)
 
-    with pytest.raises(ZeroDivisionError), run_beside(work) as future:
+    with pytest.raises(ZeroDivisionError), run_in_thread(work) as future:
         assert began.wait(timeout=60)
         raise ZeroDivisionError
     assert isinstance(future.exception(timeout=0), CancelledError)
@@ -43,7 +43,7 @@ def test_work_beside_a_block_ends_with_the_block():
 def test_checkpoints_of_blocks_around_the_work_are_called_first():
     called = []
     with at_checkpoints(lambda: called.append("outer")):
-        with run_beside(checkpoint) as future:
+        with run_in_thread(checkpoint) as future:
             future.result(timeout=60)
         with at_checkpoints(lambda: called.append("inner")):
             checkpoint()

@@ -161,9 +161,7 @@ def test_scenario_without_polygons_takes_over_no_keys_of_polygons(mini: Path) ->
         ("[costs]\nmetre = 12.345", "costs.metre: 12.345", "12.3450 or 12345"),
     ],
 )
-def test_costs_whose_point_may_separate_thousands_are_asked_about(
-    mini: Path, text: str, key: str, choices: str
-) -> None:
+def test_costs_with_three_decimals_are_ambiguous(mini: Path, text: str, key: str, choices: str) -> None:
     file = mini / "scenario.toml"
     scenario = file.read_text()
     file.write_text(f"{scenario}\n{text}\n")

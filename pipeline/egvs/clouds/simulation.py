@@ -651,7 +651,7 @@ def _cone_scanner(scanner: Scanner, effect: Merge[Any]) -> Scanner:
 
 
 def _static_objects(world: World, scan: EmptyScan) -> IntArray:
-    """Return a number below 0 for the solid of the static world along each row, (n,); -1 where there is none."""
+    """Return a number below 0 for the solid of the static world along each row, (n,); -1 if there is none."""
     assert scan.face is not None
     number = np.full(len(scan.face), -1, dtype=np.int64)
     on_face = scan.face >= 0

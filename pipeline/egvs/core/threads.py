@@ -77,8 +77,8 @@ def checkpoint() -> None:
 
 
 @contextmanager
-def run_beside(work: Callable[[], Result]) -> Iterator[Future[Result]]:
-    """Work on another thread during the block; at its end, work that goes on ends at its next :func:`checkpoint`."""
+def run_in_thread(work: Callable[[], Result]) -> Iterator[Future[Result]]:
+    """Run a function in a thread during the block; if it still runs then, it ends at its next :func:`checkpoint`."""
     is_over = Event()
 
     def check() -> None:
@@ -89,7 +89,7 @@ def run_beside(work: Callable[[], Result]) -> Iterator[Future[Result]]:
         with at_checkpoints(check):
             return work()
 
-    with ThreadPoolExecutor(1, "beside") as pool:
+    with ThreadPoolExecutor(1, "block") as pool:
         try:
             yield pool.submit(copy_context().run, run)
         finally:

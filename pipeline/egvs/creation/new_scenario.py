@@ -618,7 +618,7 @@ def _choose_region(draft: _Draft) -> None:
 
 
 def _choose_poles(draft: _Draft) -> None:
-    """Choose poles of the map, or locations for poles along the kerbs; InputError where there is none."""
+    """Choose poles of the map, or locations for poles along the kerbs; InputError if there are none."""
     streets, spacing_m = draft.roads.streets, draft.options.pole_spacing_m
     if draft.options.existing_poles:
         from egvs.creation import existing_poles

@@ -28,7 +28,7 @@ from egvs.artefacts.tpog import PeriodBlocks, frame_multiplicities
 from egvs.core.errors import WARNINGS_KEY, InputError
 from egvs.core.grid import Grid, IntArray
 from egvs.core.progress import ProgressCallback
-from egvs.core.threads import checkpoint, run_beside
+from egvs.core.threads import checkpoint, run_in_thread
 from egvs.scenario.model import Scenario
 from egvs.scoring import occupancy
 from egvs.scoring.occupancy import BlockCounts, count_blocks, static_voxels
@@ -212,7 +212,7 @@ def count_ahead(context: StageContext) -> Iterator[BlocksAhead | None]:
         yield None
         return
     blocks = BlocksAhead(context.scenario, context.folder.trajectories)
-    with run_beside(blocks.count) as blocks.counting:
+    with run_in_thread(blocks.count) as blocks.counting:
         yield blocks
 
 

@@ -308,7 +308,7 @@ def _record_simulated(
             watch = RegionWatch(
                 fcd, log, prepared.timing, regions, prepared.roads, sizes, demand_key(scenario), prepared.teleport_s
             )
-        with threads.run_beside(partial(simulate, prepared, progress, watch)) as simulation:
+        with threads.run_in_thread(partial(simulate, prepared, progress, watch)) as simulation:
             is_live = live and prepared.is_generated
             if not is_live:
                 simulation.result()

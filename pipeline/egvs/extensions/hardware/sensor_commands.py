@@ -446,7 +446,7 @@ def print_design(result: DesignResult, file: Path | None) -> None:
         f"mount,sensor): {result.pole},{chosen.pose.x_m:.3f},{chosen.pose.y_m:.3f},{chosen.pose.z_m:.3f},"
         f"{chosen.pose.yaw_deg:z.3f},{chosen.pose.pitch_deg:z.3f},{chosen.pose.side_tilt_deg:z.3f},"
         f"{mount_key(chosen.pose)},{chosen.sensor.name}",
-        "Mount and roll are not searched: " + "; ".join(_kept_mounts(designs)) + ".",
+        "Mount and roll are not searched: " + "; ".join(_fixed_mounts(designs)) + ".",
     ]
     if result.designed is not None:
         elevations = ", ".join(f"{value:g}" for value in result.designed.sensor.elevations_deg)
@@ -468,7 +468,7 @@ def mount_key(pose: Pose) -> str:
     return (Mount.INVERTED if pose.is_inverted else Mount.UPRIGHT).value
 
 
-def _kept_mounts(designs: Sequence[Design]) -> Iterator[str]:
+def _fixed_mounts(designs: Sequence[Design]) -> Iterator[str]:
     """Yield how the sensors hang, and with which roll."""
     names: dict[tuple[str, float], list[str]] = {}
     for design in designs:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+import os
 import re
 import shlex
 import xml.etree.ElementTree as ET
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 
 import egvs
+from egvs.artefacts.run_folder import RunFolder
 from egvs.export.export import export_run
 from egvs.extensions.hardware.installation import sheet, view
 from egvs.extensions.hardware.installation.planned_sites import PlannedSites
@@ -197,10 +200,25 @@ def test_sheets_of_a_dropped_mast_are_removed(spaced: Path, run_egvs: Any, tmp_p
     egvs.place(egvs.load(scenario, ["placement.count=2", "placement.most_per_pole=1"]), spaced)
 
 
-def test_sheet_of_a_candidate_stays_beside_others_of_the_run(spaced: Path, tmp_path: Path) -> None:
+def test_sheet_of_a_candidate_is_not_removed_with_those_of_a_plan(spaced: Path, tmp_path: Path) -> None:
     for height in (4, 5):
         sheet.write_sheets(spaced, [f"Mast West@{height}m"], kind="svg", out=tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_record_of_sheets_leads_to_no_other_file(tmp_path: Path) -> None:
+    """A record may come with a run from somebody else."""
+    run_folder, folder = RunFolder(tmp_path / "run"), tmp_path / "run" / "sheets"
+    folder.mkdir(parents=True)
+    entries = {}
+    for path in ("installation_outside.svg", "run/notes.svg", "run/sheets/installation_own.svg"):
+        (tmp_path / path).write_text("text")
+        at = os.path.relpath(tmp_path / path, run_folder.path)
+        entries[path] = {"path": at, "file": "x", "sha256": hashlib.sha256(b"text").hexdigest()}
+    entries["by file"] = {**entries["installation_outside.svg"], "path": None, "file": "../../installation_outside.svg"}
+    notes = list(sheet._remove_sheets(entries, run_folder, folder, []))
+    assert notes == ["removed, because they were of an earlier plan: installation_own.svg."]
+    assert sorted(path.name for path in tmp_path.rglob("*.svg")) == ["installation_outside.svg", "notes.svg"]
 
 
 def test_site_may_be_a_pole(spaced: Path, run_egvs: Any, tmp_path: Path) -> None:

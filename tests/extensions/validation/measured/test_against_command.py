@@ -205,7 +205,7 @@ def test_frames_of_sweeps_give_the_same_points(made: twin.Twin, mini: Path, tmp_
     assert code == 2 and "the ground of the sweeps is not that below site mast" in error
 
 
-def test_levelled_sweeps_are_told(made: twin.Twin, mini: Path, tmp_path: Path, run_egvs: Any) -> None:
+def test_levelled_sweeps_are_reported(made: twin.Twin, mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     """The pose of the site is tilted and upside down; the sweeps are those of a program that levels them."""
     pose = twin.POSE
     level = in_frame(tmp_path / "level", made, rotation_world_sensor(0.0, pose.pitch_deg, pose.roll_deg))
@@ -226,7 +226,7 @@ def test_levelled_sweeps_are_told(made: twin.Twin, mini: Path, tmp_path: Path, r
     assert code == 2 and "the sweeps are upside down for site mast" in error and "sites.mount=upright" in error
 
 
-def test_other_rings_are_told_and_nothing_is_fitted(folder: Path, tmp_path: Path, run_egvs: Any) -> None:
+def test_other_rings_are_reported_and_nothing_is_fitted(folder: Path, tmp_path: Path, run_egvs: Any) -> None:
     common = ("--against", folder, "--labels", folder, "--detector", "points", "--out", tmp_path / "out")
     code, printed, error = run_egvs("validate", *common, "--sensor", "OS1-64 2048")
     assert code == 0, error

@@ -11,8 +11,9 @@ east of true north. It is computed from the direction in which the latitude grow
 
 from __future__ import annotations
 
-import hashlib
 import math
+import os
+import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -51,6 +52,9 @@ from egvs.sensors.sites import Pose, Site, grid_bearing_deg
 
 FILE_TYPES = ("pdf", "svg")
 SHEETS_FOLDER = "sheets"
+
+_SHEET_NAME = re.compile(r"installation_.+\.[a-z]+")
+"""File name of a sheet."""
 
 _DIGEST_KEY = "sha256"
 _LATITUDE_STEP_DEG = 1e-3
@@ -343,10 +347,10 @@ def _remove_sheets(
     """Remove the files of entries that are not among the ``written`` ones; a file that somebody changed stays."""
     removed, changed = [], []
     for values in outdated.values():
-        path = run_folder.path / values["path"] if values["path"] else folder / values["file"]
-        if path in written or not path.is_file() or path.is_symlink():
+        path = run_folder.path / str(values["path"]) if values["path"] else folder / str(values["file"])
+        if path in written or not _is_sheet(path, run_folder, folder):
             continue
-        if _digest(path) == values.get(_DIGEST_KEY):
+        if files.hash_file(path) == values.get(_DIGEST_KEY):
             path.unlink()
             removed.append(path.name)
         elif values["path"]:
@@ -357,8 +361,15 @@ def _remove_sheets(
         yield f"of an earlier plan, but changed since: {', '.join(changed)}. Remove them, or rename them."
 
 
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _is_sheet(path: Path, run_folder: RunFolder, folder: Path) -> bool:
+    """Whether a recorded path is a file named as a sheet, in the run folder or the folder of sheets.
+
+    The record may be from somebody else: it must not lead to other files.
+    """
+    if path.is_symlink() or not path.is_file() or not _SHEET_NAME.fullmatch(path.name):
+        return False
+    parent = Path(os.path.realpath(path.parent))
+    return parent.is_relative_to(os.path.realpath(run_folder.path)) or parent == Path(os.path.realpath(folder))
 
 
 def _report_entry(data: SheetData, path: Path, folder: RunFolder) -> dict[str, Any]:
@@ -372,7 +383,7 @@ def _report_entry(data: SheetData, path: Path, folder: RunFolder) -> dict[str, A
         "frames": data.tolerances.frames,
         "file": path.name,
         "path": path_in_run(path, folder),
-        _DIGEST_KEY: _digest(path),
+        _DIGEST_KEY: files.hash_file(path),
     }
 
 
