@@ -138,10 +138,10 @@ def draw_ranges(fit: SensorFit) -> Figure:
     return figure
 
 
-def describe_roll(roll_deg: float, digits: int = 2) -> str:
+def describe_fitted_roll(roll_deg: float, digits: int = 2) -> str:
     """Return a roll as sites count it: from upside down, with these words before, for a sensor that is.
 
-    >>> describe_roll(1.5), describe_roll(-178.5)
+    >>> describe_fitted_roll(1.5), describe_fitted_roll(-178.5)
     ('roll 1.50', 'upside down, roll 1.50 from there')
     """
     pose = Pose(0.0, 0.0, 0.0, roll_deg=roll_deg)
@@ -187,7 +187,9 @@ def draw_ground(fit: SensorFit) -> Figure:
         limits_m = (-deepest, -2.0) if is_inverted else (deepest, 2.0)
         left_m = _VIEW_M if is_inverted and slope else -_VIEW_M
         axis.set(xlabel=f"{name} (m)", ylabel="z (m)", xlim=(left_m, -left_m), ylim=limits_m)
-    side.set_title(f"From the side: {describe_roll(fit.plane.roll_deg)}, pitch {fit.plane.pitch_deg:.2f} degrees")
+    side.set_title(
+        f"From the side: {describe_fitted_roll(fit.plane.roll_deg)}, pitch {fit.plane.pitch_deg:.2f} degrees"
+    )
     across.set_title("Along the sensor's x axis")
     _bars(rates, [(b.from_m, b.to_m, b.rate) for b in fit.road_rates], 100.0, _GREEN, "from the road alone")
     _bars(rates, [(b.from_m, b.to_m, b.rate) for b in fit.rates_towards_road], 100.0, _GREY, "from vehicles as well")

@@ -19,7 +19,7 @@ from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
 from egvs.extensions.hardware.fit import empty_scan, figures
 from egvs.extensions.hardware.fit.calibration import CalibratedPose
-from egvs.extensions.hardware.fit.figures import describe_roll
+from egvs.extensions.hardware.fit.figures import describe_fitted_roll
 from egvs.extensions.hardware.fit.fit import SensorFit
 from egvs.extensions.hardware.fit.map_pose import MapPose
 from egvs.extensions.hardware.fit.range_noise import NoiseBin
@@ -167,13 +167,13 @@ def _comments(fit: SensorFit, name: str) -> str:
     plane = fit.plane
     lines.append(
         f"Pose over the chosen ground plane: {plane.height_m:.2f} m above it, "
-        f"{describe_roll(plane.roll_deg)}, pitch {plane.pitch_deg:.2f} degrees."
+        f"{describe_fitted_roll(plane.roll_deg)}, pitch {plane.pitch_deg:.2f} degrees."
     )
     if fit.map_pose is not None:
         pose = fit.map_pose.best.pose
         lines.append(
             f"Pose in the world of {fit.map_pose.scenario}: x {pose.x_m:.3f}, y {pose.y_m:.3f}, z {pose.z_m:.3f} m, "
-            f"yaw {pose.yaw_deg:.3f}, pitch {pose.pitch_deg:.3f}, {describe_roll(pose.roll_deg, 3)} degrees."
+            f"yaw {pose.yaw_deg:.3f}, pitch {pose.pitch_deg:.3f}, {describe_fitted_roll(pose.roll_deg, 3)} degrees."
         )
         lines += fit.map_pose.warnings
     if fit.calibrated_pose is not None:
@@ -191,7 +191,7 @@ def calibration_lines(calibrated: CalibratedPose) -> list[str]:
     pose = calibrated.pose
     return [
         f"pose in {calibrated.frame} by {calibrated.file}: x {pose.x_m:.3f}, y {pose.y_m:.3f}, z {pose.z_m:.3f} m, "
-        f"yaw {pose.yaw_deg:.3f}, pitch {pose.pitch_deg:.3f}, {describe_roll(pose.roll_deg, 3)} degrees",
+        f"yaw {pose.yaw_deg:.3f}, pitch {pose.pitch_deg:.3f}, {describe_fitted_roll(pose.roll_deg, 3)} degrees",
         f"the chosen ground plane in {calibrated.frame}: z = {calibrated.ground_z_m:.2f} m below the sensor, tilted by "
         f"{calibrated.ground_tilt_deg:.2f} degrees",
     ]
