@@ -128,7 +128,7 @@ def test_run_prints_the_quoted_messages(mini: Path, tmp_path: Path, run_egvs: An
     folder = tmp_path / "run"
     code, out, error = run_egvs("run", mini, "--verbose", "--out", folder, "--set", "roi.center_m=[20,60,2.5]")
     assert code == 0, error
-    assert quoted("no vehicle ever enters the region").search(out + error)
+    assert quoted("… ever enters the region").search(out + error)
 
     record = folder / "run.json"
     record.write_text(record.read_text(encoding="utf-8").replace("gamma", "gamme"), encoding="utf-8")
