@@ -70,7 +70,7 @@ def accept(
         float, typer.Option(metavar="M", min=0, help="Largest error of the position.")
     ] = _LIMITS.position_m,
     tilt: Annotated[
-        float, typer.Option(metavar="DEG", min=0, help="Largest angle between the planned and the measured z axis.")
+        float, typer.Option(metavar="DEG", min=0, help="Largest turn that is left without the error of the yaw.")
     ] = _LIMITS.tilt_deg,
     yaw: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of the yaw.")] = _LIMITS.yaw_deg,
     blocked: Annotated[

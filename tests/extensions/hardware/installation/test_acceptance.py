@@ -21,7 +21,7 @@ from egvs.extensions.hardware.installation import acceptance, scan_comparison
 from egvs.extensions.hardware.installation.acceptance import Acceptance, PoseError, accept
 from egvs.extensions.hardware.installation.acceptance_limits import Limits
 from egvs.extensions.hardware.installation.scan_comparison import ScanComparison, StaticWorld
-from egvs.extensions.hardware.registration import PARAMETERS, StaticSurfaces, register_scan
+from egvs.extensions.hardware.registration import PARAMETERS, Registration, StaticSurfaces, register_scan
 from egvs.scoring.visibility import Beams
 from egvs.sensors.beam_files import BeamTable
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
@@ -181,6 +181,23 @@ def test_expected_range_of_a_beam_to_the_ground_is_height_by_sine(installed: Ins
 
 ENDLESS = (-math.inf, math.inf)
 CORRIDOR = (-8.0, 6.0)
+
+
+@pytest.mark.parametrize(
+    ("yaw_error_deg", "pitch_error_deg", "roll_error_deg", "tilt_deg"),
+    [(3.0, 0.0, 0.0, 0.0), (0.0, 1.5, 0.0, 1.5), (3.0, 1.5, 0.0, 1.5), (3.0, 0.0, 1.5, 1.5), (90.0, 0.0, 0.0, 0.0)],
+)
+@pytest.mark.parametrize("roll_deg", [0.0, 180.0])
+def test_yaw_error_of_a_tilted_sensor_is_no_tilt(
+    roll_deg: float, yaw_error_deg: float, pitch_error_deg: float, roll_error_deg: float, tilt_deg: float
+) -> None:
+    planned = Pose(0.0, 0.0, 4.0, 30.0, -20.0, roll_deg)
+    measured = Pose(0.0, 0.0, 4.0, 30.0 + yaw_error_deg, -20.0 + pitch_error_deg, roll_deg + roll_error_deg)
+    fit = Registration(measured, 1e-4 * np.eye(6), (), np.zeros(1), np.ones(1, dtype=np.bool_), 0.01, 0.01, True)
+    error = PoseError.of(planned, fit)
+    assert error.values["yaw_deg"] == pytest.approx(yaw_error_deg)
+    assert error.tilt_deg == pytest.approx(tilt_deg)
+    assert error.tilt_se_deg == pytest.approx(0.01 if tilt_deg else 0.0, rel=1e-3)
 
 
 def test_direction_that_no_wall_fixes_fails_the_position() -> None:
