@@ -17,11 +17,12 @@ import egvs
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.extensions import hardware
-from egvs.extensions.hardware.installation import acceptance, scan_comparison
+from egvs.extensions.hardware.installation import acceptance, acceptance_page, scan_comparison
 from egvs.extensions.hardware.installation.acceptance import Acceptance, PoseError, accept
 from egvs.extensions.hardware.installation.acceptance_limits import Limits
 from egvs.extensions.hardware.installation.scan_comparison import ScanComparison, StaticWorld
 from egvs.extensions.hardware.registration import PARAMETERS, Registration, StaticSurfaces, register_scan
+from egvs.runs.run import FolderInUseError, lock_run_folder
 from egvs.scoring.visibility import Beams
 from egvs.sensors.beam_files import BeamTable
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
@@ -290,6 +291,29 @@ def test_command_prints_reason_and_writes_files(installed: InstalledRun, run_egv
     assert f"<dt>Yaw error</dt><dd>{yaw_error:+z.2f} degrees</dd>" in page  # never -0.00
     code, printed, _ = run_egvs(*words, "--tilt", "2")
     assert (code, "passed" in printed) == (0, True)
+
+
+def test_folder_in_use_is_refused_before_anything_is_read(run_egvs: Any, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    with lock_run_folder(tmp_path):
+        code, printed, errors = run_egvs("accept", tmp_path, "--site", "a", "--scan", tmp_path / "no_scan.pcd")
+    assert (code, printed) == (2, "")
+    assert "another command is using this folder. Repeat egvs accept when it has ended" in errors
+
+
+def test_verdict_is_printed_though_a_command_began_meanwhile(
+    installed: InstalledRun, run_egvs: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(folder: Path, *_: object) -> None:
+        raise FolderInUseError(f"{folder}: another run is using this folder")
+
+    monkeypatch.setattr(acceptance_page, "add_to_report", refuse)
+    scan = installed.write("as_planned.ply", installed.points())
+    out = tmp_path / "out"
+    code, printed, errors = run_egvs("accept", installed.folder, "--site", "pole_a", "--scan", scan, "--out", out)
+    assert (code, "pole_a (wide): passed" in printed) == (2, True)
+    assert "its report lacks this verdict" in errors
+    assert (out / "acceptance_pole_a.json").is_file()
 
 
 def test_plan_and_command_have_the_same_default_limits() -> None:
