@@ -161,7 +161,7 @@ _BY_SEVERITY = (
         "traffic through solids",
     ),
     ("sites on lanes", "blocked sites", "measured scan", "vehicles off their lanes", "vehicles against lanes"),
-    ("mesh units", "mesh axes", "few beams", "beam angles", "blind sites", "track alignment"),
+    ("mesh units", "mesh axes", "few beams", "beam angles", "upward beams", "blind sites", "track alignment"),
 )
 """Rules of warnings that make a result worthless, that tell of traffic that cannot be, of sites where no sensor can
 stand, and of scenes that are not as they are in reality; all other warnings are less serious."""
