@@ -745,7 +745,9 @@ def new(
     list_: Annotated[
         bool,
         typer.Option(
-            "--list", help="List the junctions of the road map: names, arms, signals, --at. Nothing is written."
+            "--list",
+            help="List the junctions of the road map: names, arms, signals, --at. With --at, the nearest first."
+            " Nothing is written.",
         ),
     ] = False,
     run_: Annotated[
@@ -764,7 +766,7 @@ def new(
     paths = [*(maps or []), *(more or [])]
     if list_:
         others = {
-            "--at": at, "--download": download, "--surroundings": surroundings, "--traffic": traffic, "--run": run_,
+            "--download": download, "--surroundings": surroundings, "--traffic": traffic, "--run": run_,
             "--vehicles-per-hour": vehicles_per_hour, "--counts": counts, "--poles": poles, "--tracks": tracks,
             "--like": like, "--signals": signals, "--align": align, "--surface": surface, "--overpass": overpass_url,
             "--pedestrian-tracks": pedestrian_tracks, "--track-columns": track_columns, "--track-crs": track_crs,
@@ -772,7 +774,8 @@ def new(
         for option in filter(others.get, others):
             raise InputError(option, "has no effect with --list", "Remove one of them.")
         maps_given = [*(maps or []), *([folder] if folder else []), *(more or [])]  # --from A B takes B for the folder
-        _list_junctions(maps_given, NewScenarioOptions(lefthand=lefthand, righthand=righthand, walk=walk))
+        near = None if at is None else cli_options.latitude_and_longitude(at)
+        _list_junctions(maps_given, NewScenarioOptions(lefthand=lefthand, righthand=righthand, walk=walk), near)
         return
     if folder is None:
         raise InputError("FOLDER", "no folder is given", "Name the folder of the new scenario, or use --list.")
@@ -820,7 +823,7 @@ def new(
         run(folder)
 
 
-def _list_junctions(paths: Sequence[Path], options: NewScenarioOptions) -> None:
+def _list_junctions(paths: Sequence[Path], options: NewScenarioOptions, at: tuple[float, float] | None = None) -> None:
     from egvs.cli import new_summary
     from egvs.cli.console import ProgressDisplay
     from egvs.creation.new_scenario import list_junctions
@@ -828,7 +831,7 @@ def _list_junctions(paths: Sequence[Path], options: NewScenarioOptions) -> None:
     if not paths:
         raise InputError("--from", "no map is given", "Give a map of the roads, such as --from town.osm.")
     with ProgressDisplay("new", prints_progress=True) as screen:
-        listed = list_junctions(paths, options, screen.progress)
+        listed = list_junctions(paths, options, screen.progress, at)
     new_summary.print_junctions(listed)
 
 
