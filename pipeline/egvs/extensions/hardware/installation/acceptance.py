@@ -450,6 +450,8 @@ def _check_frame(
 ) -> None:
     """Raise an InputError that names the frame in which scans fit the static world, if one fits well."""
     own_frame = "Export it in the sensor's own frame: x forward, y left, z along its axis, right-handed."
+    turn_back = f"Turn points of egvs clouds, which are levelled, back by pitch {start.pitch_deg:g} and roll"
+    level_hint = f"{own_frame} {turn_back} {start.roll_deg:g} degrees."
     other_mount = "upright" if start.is_inverted else "inverted"
     level = rotation_world_sensor(0.0, start.pitch_deg, start.roll_deg)
     frames: list[tuple[FloatArray, str, str]] = [
@@ -462,7 +464,7 @@ def _check_frame(
         (np.diag([1.0, 1.0, -1.0]), "with z reversed", own_frame),
     ]
     if start.pitch_deg or start.roll_deg:
-        frames.append((level, "at pitch 0 and roll 0: it was levelled", own_frame))
+        frames.append((level, "at pitch 0 and roll 0: it was levelled", level_hint))
     if start.is_inverted:
         hung = rotation_world_sensor(0.0, start.pitch_deg, start.side_tilt_deg)
         frames.append((hung @ np.diag([1.0, -1.0, -1.0]), "levelled and the other way up", own_frame))
