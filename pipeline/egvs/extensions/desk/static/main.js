@@ -1,0 +1,130 @@
+// Starts the page: connects it with the server, and draws what changed.
+import { listen } from "./api.js";
+import { byId, h, keepingFocus, show } from "./dom.js";
+import { data, fetchStart, fetchState, onChange, say, takeJob, update } from "./store.js";
+import { change, isBusy } from "./store.js";
+import { forgetRefused } from "./fields.js";
+import { drawJob } from "./progress.js";
+import { drawStart } from "./start.js";
+import { drawPoles } from "./poles.js";
+import { drawCounts, drawDiagram } from "./counts.js";
+import { drawRun } from "./run.js";
+import { drawPlan } from "./plan.js";
+import { drawTake } from "./take.js";
+import { drawMap, showScore } from "./desk_map.js";
+
+/** @type {{id: string, title: string, draw: (panel: HTMLElement) => void, isDone: (project: any) => boolean}[]} */
+const STEPS = [
+  { id: "poles", title: "Poles", draw: drawPoles, isDone: (project) => project.sites.length > 0 },
+  { id: "traffic", title: "Traffic", draw: drawCounts, isDone: (project) => project.counts_total_per_h > 0 },
+  { id: "run", title: "Run", draw: drawRun, isDone: (project) => project.run.state === "complete" },
+  { id: "plan", title: "Decide", draw: drawPlan, isDone: (project) => project.run.has_plan && !project.run.plan_outdated },
+  { id: "take", title: "Take along", draw: drawTake, isDone: () => false },
+];
+
+/** @param {string} id */
+function go(id) {
+  if (location.hash !== `#${id}`) location.hash = id;
+  else readStep();
+}
+
+function readStep() {
+  const step = STEPS.some(({ id }) => `#${id}` === location.hash) ? location.hash.slice(1) : "poles";
+  if (step === data.step) return;
+  forgetRefused();
+  update({ step, isAdding: false, suggestions: null });
+  byId("panel").scrollTop = 0;
+}
+
+function drawHeader() {
+  const { project, step } = data;
+  document.title = project ? `${project.name} – egvs desk` : "egvs desk";
+  byId("title").textContent = project ? project.title || project.name : "";
+  byId("steps").hidden = byId("history").hidden = !project;
+  if (!project) return;
+  show(byId("steps"), h("ol", {}, STEPS.map(({ id, title, isDone }, number) => {
+    const done = isDone(project);
+    return h("li", {}, h(`button${done ? ".done" : ""}`, {
+      type: "button", "data-key": `step.${id}`, "aria-current": id === step ? "step" : null, onclick: () => go(id),
+    }, h("span.number", { "aria-hidden": "true" }, done ? "✓" : number + 1), title, done && h("span.unseen", {}, " (done)")));
+  })));
+  for (const name of /** @type {const} */ (["undo", "redo"])) {
+    const button = byId(name);
+    button.disabled = !project[name] || isBusy();
+    button.title = project[name] ? `${name === "undo" ? "Undo" : "Redo"}: ${project[name]}` : "";
+  }
+}
+
+function drawNext() {
+  const at = STEPS.findIndex(({ id }) => id === data.step);
+  const next = STEPS[at + 1];
+  return next && h("footer.next", {},
+    h("button", { type: "button", "data-key": "next", onclick: () => go(next.id) }, `Next: ${next.title} `, h("span", { "aria-hidden": "true" }, "→")));
+}
+
+/** @param {Set<string>} changed */
+function draw(changed) {
+  const main = byId("main");
+  const panel = byId("panel");
+  main.className = data.project ? `desk ${data.step}` : data.upload?.streets ? "desk choosing" : "start";
+  if (changed.size === 1 && changed.has("log")) return drawJob();
+  drawJob();
+  keepingFocus(byId("top"), drawHeader);
+  if (data.revision < 0) return;
+  if (changed.size === 1 && changed.has("job") && isBusy() && data.wasBusy === true) return;
+  data.wasBusy = isBusy();
+  keepingFocus(panel, () => {
+    if (!data.project) return drawStart(panel);
+    const step = STEPS.find(({ id }) => id === data.step);
+    step?.draw(panel);
+    const next = drawNext();
+    if (next) panel.append(next);
+  });
+  drawMap(changed);
+  keepingFocus(byId("stage"), drawDiagram);
+}
+
+/** @param {"undo"|"redo"} name */
+function stepBack(name) {
+  if (data.project?.[name] && !isBusy()) {
+    const what = data.project[name];
+    change("POST", name).then((state) => state && say(`${name === "undo" ? "Undone" : "Done again"}: ${what}.`));
+  }
+}
+
+/** @param {KeyboardEvent} event */
+function shortcuts(event) {
+  if (!(event.ctrlKey || event.metaKey) || event.altKey) return;
+  const isTyping = event.target instanceof HTMLInputElement && event.target.type === "text" && event.target.value !== event.target.defaultValue;
+  const key = event.key.toLowerCase();
+  const name = key === "z" ? (event.shiftKey ? "redo" : "undo") : key === "y" ? "redo" : null;
+  if (!name || isTyping) return;
+  event.preventDefault();
+  stepBack(name);
+}
+
+onChange(draw);
+onChange((changed) => {
+  if (changed.has("project") && !data.project) fetchStart();
+});
+byId("undo").addEventListener("click", () => stepBack("undo"));
+byId("redo").addEventListener("click", () => stepBack("redo"));
+byId("home").addEventListener("click", () => {
+  update({ upload: null });
+  if (data.project) change("POST", "close");
+});
+addEventListener("keydown", shortcuts);
+addEventListener("hashchange", readStep);
+readStep();
+let wasLost = false;
+listen({
+  state: ({ revision }) => revision !== data.revision && fetchState(),
+  job: takeJob,
+  log: ({ line }) => update({ log: [...data.log, line].slice(-200) }),
+  score: showScore,
+}, (isConnected) => {
+  if (isConnected && wasLost) fetchState().then(() => say("Connected again."));
+  if (!isConnected && !wasLost) say("The desk does not answer. Is the command “egvs desk” still running?", "error");
+  wasLost = !isConnected;
+});
+fetchState();
