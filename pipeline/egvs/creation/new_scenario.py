@@ -489,6 +489,23 @@ def list_junctions(
 ) -> list[ListedJunction]:
     """Return the junctions of a road map of which a scenario can be made, the largest first; nothing is written.
 
+    Parameters and errors are those of :func:`read_map_streets`.
+    """
+    streets = read_map_streets(maps, options, progress)
+    progress("lists the junctions", 0, 0)
+    return [
+        ListedJunction(
+            junction.title, junction.arms, junction.lanes_in, junction.signalised, _at_option(streets, junction.at_m)
+        )
+        for junction in junctions.distinct_crossings(streets)
+    ]
+
+
+def read_map_streets(
+    maps: Sequence[str | Path], options: NewScenarioOptions | None = None, progress: ProgressCallback = no_progress
+) -> Streets:
+    """Return the streets of a road map; nothing is written.
+
     Parameters
     ----------
     maps
@@ -509,15 +526,7 @@ def list_junctions(
         files = map_readers.open_maps(unpacked.paths)
         progress("reads the roads", 0, 0)
         road_options = RoadOptions(options.lefthand, options.walk, bool(files.terrain), None, options.righthand)
-        streets = _read_roads(files.roads, road_options).streets
-        progress("lists the junctions", 0, 0)
-        return [
-            ListedJunction(
-                junction.title, junction.arms, junction.lanes_in, junction.signalised,
-                _at_option(streets, junction.at_m),
-            )
-            for junction in junctions.distinct_crossings(streets)
-        ]  # fmt: skip
+        return _read_roads(files.roads, road_options).streets
 
 
 def _open_files(
