@@ -1,4 +1,5 @@
 // The counts: numbers at the arrows of the junction's approaches, and their totals.
+import { bendOf } from "./arrows.js";
 import { byId, h, s, show } from "./dom.js";
 import { numberField } from "./fields.js";
 import { readable } from "./numbers.js";
@@ -72,6 +73,7 @@ function showTotals() {
 const arrows = s("svg.arrows", { "aria-hidden": "true" });
 const cards = h("div.cards");
 const diagram = h("div.diagram", {}, arrows, cards);
+const sizes = new ResizeObserver(() => place());
 
 export function drawDiagram() {
   const stage = byId("stage");
@@ -83,7 +85,9 @@ export function drawDiagram() {
   }
   if (!diagram.isConnected) stage.append(diagram);
   const isLocked = !data.project.counts_editable || isBusy();
+  sizes.disconnect();
   show(cards, data.project.approaches.map((/** @type {any} */ approach) => approachCard(approach, isLocked)));
+  for (const card of cards.children) sizes.observe(card); // a message makes a card taller
   const map = mapView();
   map.onPlace = place;
   if (fitted !== data.project.id + data.map.key) {
@@ -104,8 +108,10 @@ function boxOfMovements() {
 
 /** @param {any} approach @param {boolean} isLocked */
 function approachCard(approach, isLocked) {
-  const rows = movementsOf(approach.approach).map((/** @type {any} */ movement) => {
+  const movements = movementsOf(approach.approach);
+  const rows = movements.map((/** @type {any} */ movement) => {
     const label = `${approach.approach}, ${movement.turn || "all turns"}${movement.to ? ` to ${movement.to}` : ""}`;
+    const isTwice = movements.filter((/** @type {any} */ other) => other.turn === movement.turn).length > 1;
     const row = h("div.count", { title: movement.to ? `${movement.turn} to ${movement.to}` : movement.turn },
       s("svg.turn", { viewBox: "0 0 24 24", "aria-hidden": "true" }, s("path", { d: TURNS[movement.turn] ?? TURNS.straight })),
       numberField({
@@ -118,7 +124,7 @@ function approachCard(approach, isLocked) {
           draft.set(movement.index, value ?? 0);
           showTotals();
         },
-      }));
+      }), isTwice && movement.to && h("small", {}, `to ${movement.to}`));
     row.addEventListener("focusin", () => highlight(movement.index));
     row.addEventListener("focusout", () => highlight(null));
     row.addEventListener("pointerenter", () => highlight(movement.index));
@@ -150,7 +156,7 @@ function placeArrows() {
   arrows.setAttribute("viewBox", `0 0 ${map.width} ${map.height}`);
   const flows = movements.map((/** @type {any} */ movement) => {
     const [from, via, to] = [movement.from_m, movement.via_m, movement.to_m].map((point) => map.toPixel(point));
-    const bend = [0, 1].map((axis) => 2 * via[axis] - (from[axis] + to[axis]) / 2);
+    const bend = bendOf(from, via, to);
     const width = countOf(movement) > 0 ? 2 + (10 * countOf(movement)) / most : 1;
     const angle = Math.atan2(to[1] - bend[1], to[0] - bend[0]);
     const size = 6 + width * 0.6;

@@ -1,6 +1,7 @@
 // What the map shows in each step, and what happens when one points at it.
 import { latestWins, post } from "./api.js";
 import { byId } from "./dom.js";
+import { shortTitle } from "./junctions.js";
 import { MapView } from "./mapview.js";
 import { announce, attempt, change, data, say, update } from "./store.js";
 
@@ -76,7 +77,7 @@ export function boxAround() {
 
 /** @param {any[]} junctions @returns {Item[]} */
 function junctionItems(junctions) {
-  return junctions.map((junction) => ({ id: junction.id, at_m: [junction.x_m, junction.y_m], label: junction.title, kind: "junction", classes: ["quietly"], title: junction.title }));
+  return junctions.map((junction) => ({ id: junction.id, at_m: [junction.x_m, junction.y_m], label: shortTitle(junction.title).slice(0, 48), kind: "junction", classes: ["quietly"], title: junction.title }));
 }
 
 /** @returns {Item[]} */
@@ -149,7 +150,7 @@ async function addPole([x_m, y_m]) {
   map.clearRefusal();
   const state = await change("POST", "sites", { x_m, y_m }, (error) => refuse([x_m, y_m], error.reason));
   if (!state) return;
-  update({ selected: state.site, suggestions: data.suggestions && data.suggestions.filter((pole) => pole.x_m !== x_m || pole.y_m !== y_m) });
+  update({ isAdding: false, selected: state.site, suggestions: data.suggestions && data.suggestions.filter((pole) => pole.x_m !== x_m || pole.y_m !== y_m) });
   announce(`Added ${state.site}.`);
 }
 

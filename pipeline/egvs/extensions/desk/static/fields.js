@@ -86,7 +86,7 @@ export function textInput({ key, label, hasUnseenLabel, text, mode, unit, placeh
   const commit = () => {
     const typed = input.value;
     if (typed === sent) return;
-    sent = typed;
+    sent = input.defaultValue = typed;
     refused.delete(key);
     mark("");
     if (typed.trim() === text) {

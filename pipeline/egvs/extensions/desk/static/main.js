@@ -13,10 +13,13 @@ import { drawPlan } from "./plan.js";
 import { drawTake } from "./take.js";
 import { drawMap, showScore } from "./desk_map.js";
 
-/** @type {{id: string, title: string, draw: (panel: HTMLElement) => void, isDone: (project: any) => boolean}[]} */
+/** Steps that were left for another one. @type {Set<string>} */
+const visited = new Set();
+
+/** @type {{id: string, title: string, isOptional?: boolean, draw: (panel: HTMLElement) => void, isDone: (project: any) => boolean}[]} */
 const STEPS = [
-  { id: "poles", title: "Poles", draw: drawPoles, isDone: (project) => project.sites.length > 0 },
-  { id: "traffic", title: "Traffic", draw: drawCounts, isDone: (project) => project.counts_total_per_h > 0 },
+  { id: "poles", title: "Poles", isOptional: true, draw: drawPoles, isDone: (project) => project.sites.length > 0 && visited.has("poles") },
+  { id: "traffic", title: "Traffic", isOptional: true, draw: drawCounts, isDone: (project) => project.counts_total_per_h > 0 && visited.has("traffic") },
   { id: "run", title: "Run", draw: drawRun, isDone: (project) => project.run.state === "complete" },
   { id: "plan", title: "Decide", draw: drawPlan, isDone: (project) => project.run.has_plan && !project.run.plan_outdated },
   { id: "take", title: "Take along", draw: drawTake, isDone: () => false },
@@ -24,6 +27,7 @@ const STEPS = [
 
 /** @param {string} id */
 function go(id) {
+  visited.add(data.step);
   if (location.hash !== `#${id}`) location.hash = id;
   else readStep();
 }
@@ -59,7 +63,7 @@ function drawNext() {
   const at = STEPS.findIndex(({ id }) => id === data.step);
   const next = STEPS[at + 1];
   return next && h("footer.next", {},
-    h("button", { type: "button", "data-key": "next", onclick: () => go(next.id) }, `Next: ${next.title} `, h("span", { "aria-hidden": "true" }, "→")));
+    h(`button${STEPS[at].isOptional || STEPS[at].isDone(data.project) ? ".main" : ""}`, { type: "button", "data-key": "next", onclick: () => go(next.id) }, `Next: ${next.title} `, h("span", { "aria-hidden": "true" }, "→")));
 }
 
 /** @param {Set<string>} changed */

@@ -88,6 +88,9 @@ export function percent(share, decimals = 0) {
   return share === null || share === undefined ? "–" : `${readable(100 * share, decimals)} %`;
 }
 
+/** @param {string} text */
+export const capitalised = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+
 /**
  * Return a duration: "40 s", "3 min", "1 h 20 min".
  * @param {number} seconds

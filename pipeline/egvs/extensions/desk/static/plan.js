@@ -2,7 +2,7 @@
 import { h, s, show } from "./dom.js";
 import { latestWins } from "./api.js";
 import { button, numberField, radioField } from "./fields.js";
-import { percent, readable } from "./numbers.js";
+import { capitalised, percent, readable } from "./numbers.js";
 import { choosePole, siteOf } from "./desk_map.js";
 import { change, data, isBusy, runJob, update } from "./store.js";
 import { drawWhatIf } from "./what_if.js";
@@ -98,19 +98,19 @@ function drawResult(plan) {
   const hasCost = plan.sensors.some((/** @type {any} */ sensor) => sensor.cost);
   return h("section", {},
     h("h2", {}, plan.outdated ? "Plan before the changes" : `${plan.sensors.length} ${plan.sensors.length === 1 ? "sensor" : "sensors"}: ${plan.score_text} ${plan.label}`),
-    h("p.quiet", {}, plan.certificate_text, hasCost && ` Costs ${readable(plan.cost)}.`),
-    h("ol.sensors", {}, plan.sensors.map((/** @type {any} */ sensor) => sensorItem(sensor))),
+    h("p.quiet", {}, `${capitalised(plan.certificate_text)}.`, hasCost && ` Costs ${readable(plan.cost)}.`),
+    h("ol.sensors", {}, plan.sensors.map((/** @type {any} */ sensor) => sensorItem(sensor, plan.unit === "%" ? " percentage points" : ` ${plan.unit}`))),
     curve(plan),
     h("div.tools", {}, button(data.keptPlan ? "Compare with this one instead" : "Keep, to compare with another", () => update({ keptPlan: plan }), { key: "keep" })));
 }
 
-/** @param {any} sensor */
-function sensorItem(sensor) {
+/** @param {any} sensor @param {string} points unit of gains */
+function sensorItem(sensor, points) {
   const name = siteOf(sensor.pole ?? sensor.site);
   return h("li", {}, h("div", {},
     h("button.link", { type: "button", "data-key": `sensor.${sensor.site}`, "aria-pressed": String(name === data.selected), onclick: () => choosePole(name) }, sensor.pole ?? sensor.site),
     ` ${sensor.sensor}, ${readable(sensor.z_m, 1)} m up, tilt ${readable(sensor.pitch_deg)}°`,
-    h("small", {}, `Adds ${sensor.gain_text}`, sensor.loss_text && `; if it fails, ${sensor.loss_text} are lost`, sensor.cost ? `; costs ${readable(sensor.cost)}` : "", sensor.forced && "; it must be chosen"),
+    h("small", {}, `Adds ${sensor.gain_text}${points}`, sensor.loss_text && `; if it fails, ${sensor.loss_text}${points} are lost`, sensor.cost ? `; costs ${readable(sensor.cost)}` : "", sensor.forced && "; it must be chosen"),
     (sensor.adds_text ?? []).map((/** @type {string} */ text) => h("small", {}, text))));
 }
 
@@ -119,7 +119,7 @@ function curve(plan) {
   const points = plan.curve;
   if (points.length < 2) return null;
   const most = Math.max(...points.map((/** @type {any} */ point) => point.score));
-  const [step, height] = [300 / points.length, 90];
+  const [step, height] = [Math.min(60, 300 / points.length), 90];
   const bars = points.map((/** @type {any} */ point, /** @type {number} */ at) => {
     const tall = most > 0 ? (height * point.score) / most : 0;
     return s(`g${point.count === plan.sensors.length ? ".chosen" : ""}`, {},
@@ -128,14 +128,14 @@ function curve(plan) {
       s("text", { x: at * step + step / 2, y: height + 30 }, point.count));
   });
   const label = points.map((/** @type {any} */ point) => `${point.count}: ${point.score_text}`).join("; ");
-  return h("figure", {}, s("svg.curve", { viewBox: `0 0 300 ${height + 36}`, role: "img", "aria-label": `${plan.label} by number of sensors. ${label}` }, bars), h("figcaption", {}, `${plan.label} by number of sensors`));
+  return h("figure", {}, s("svg.curve", { viewBox: `0 0 300 ${height + 36}`, role: "img", "aria-label": `${plan.label} by number of sensors. ${label}` }, bars), h("figcaption", {}, `${capitalised(plan.label)} by number of sensors`));
 }
 
 /** @param {any} a @param {any} b */
 function comparison(a, b) {
   const names = (/** @type {any} */ plan) => plan.sensors.map((/** @type {any} */ sensor) => sensor.site).join(", ");
   /** @type {[string, (plan: any) => import("./dom.js").Child][]} */
-  const lines = [["Sensors", (plan) => plan.sensors.length], [b.label, (plan) => plan.score_text], ["Costs", (plan) => (plan.cost ? readable(plan.cost) : "–")], ["Poles", names]];
+  const lines = [["Sensors", (plan) => plan.sensors.length], [capitalised(b.label), (plan) => plan.score_text], ["Costs", (plan) => (plan.cost ? readable(plan.cost) : "–")], ["Poles", names]];
   return h("section.card", {}, h("h2", {}, "Two plans"), h("div.table", {}, h("table.compare", {}, h("caption.unseen", {}, "The plan that was kept, and this one"),
     h("thead", {}, h("tr", {}, h("td"), h("th", { scope: "col" }, "Kept"), h("th", { scope: "col" }, "This one"))),
     h("tbody", {}, lines.map(([title, cell]) => h("tr", {}, h("th", { scope: "row" }, title), h("td", {}, cell(a)), h("td", {}, cell(b))))))),

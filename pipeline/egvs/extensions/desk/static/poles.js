@@ -39,11 +39,18 @@ export function drawPoles(panel) {
           type: "button", "data-key": `pole.${site.site}`, "aria-pressed": String(site.site === data.selected), onclick: () => choosePole(site.site),
         }, site.site) },
         { title: "Kind", cell: kindOf },
-        { title: "Height, m", isNumber: true, cell: (site) => (site.z_m === null ? h("span.quiet", {}, "default") : fieldText(site.z_m)) },
+        { title: "Height, m", isNumber: true, cell: (site) => (site.z_m === null ? h("span.quiet", {}, listText(project.mounts.heights_m)) : fieldText(site.z_m)) },
         { title: "Use", cell: (site) => (site.must ? "must" : site.must_not ? "must not" : "") },
       ],
     }),
-    forAll(project, isLocked));
+    forAll(project, isLocked),
+    assumptions(project));
+}
+
+/** What the new scenario assumed, and what was noticed in its map. @param {any} project */
+function assumptions({ assumed, notes }) {
+  const list = (/** @type {string} */ title, /** @type {string[]} */ texts) => texts.length > 0 && [h("h2", {}, title), h("ul.notes", {}, texts.map((text) => h("li", {}, text)))];
+  return (assumed.length > 0 || notes.length > 0) && h("details.card", {}, h("summary", {}, "Assumed, not measured"), list("Assumed", assumed), list("Noticed in the map", notes));
 }
 
 async function showKerbs() {
@@ -84,8 +91,9 @@ function details(site, isLocked) {
     h("div.pair", {},
       field("x_m", "East", { unit: "m", limits: { optional: false } }),
       field("y_m", "North", { unit: "m", limits: { optional: false } })),
-    h("div.pair", {}, sensor, field("cost", "Cost", { limits: { min: 0 }, placeholder: "as for all" })),
-    h("div.pair", {}, use, checkField(`${site.site}.exists`, "The pole exists already", site.exists, (isChecked) => change("PATCH", path, { exists: isChecked }), isLocked)),
+    sensor,
+    use,
+    h("div.pair", {}, field("cost", "Cost", { limits: { min: 0 }, placeholder: "as for all" }), checkField(`${site.site}.exists`, "The pole exists already", site.exists, (isChecked) => change("PATCH", path, { exists: isChecked }), isLocked)),
     button("Remove this pole", () => removePole(site.site), { isDisabled: isLocked }));
 }
 

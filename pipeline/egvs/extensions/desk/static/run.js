@@ -2,7 +2,7 @@
 import { get, post } from "./api.js";
 import { byId, h, show } from "./dom.js";
 import { button, numberField, pagedTable, turnTo } from "./fields.js";
-import { duration, readable } from "./numbers.js";
+import { capitalised, duration, readable } from "./numbers.js";
 import { choosePole, siteOf } from "./desk_map.js";
 import { attempt, change, data, isBusy, runJob, say, update } from "./store.js";
 
@@ -25,7 +25,7 @@ export function drawRun(panel) {
     }),
     run.state !== "complete" && h("p.quiet", {}, `${duration(settings.traffic_s)} of traffic. 500 moments are enough for a first look, 5000 for a decision.`),
     h("div.tools", {},
-      run.state !== "complete" && button(RUN_TEXTS[run.state] ?? "Run", start, { key: "run", isMain: true, isDisabled: !canRun }),
+      run.state !== "complete" && button(RUN_TEXTS[run.state], start, { key: "run", isMain: true, isDisabled: !canRun }),
       run.state !== "complete" && button("Check the files", check, { isDisabled: !canRun }),
       run.state === "complete" && button("Open the report", () => openReport(), { isDisabled: isBusy() }),
       run.state === "complete" && button("3D view", openThree, { isDisabled: isBusy() })),
@@ -35,7 +35,7 @@ export function drawRun(panel) {
 }
 
 /** @type {Record<string, string>} */
-const RUN_TEXTS = { none: "Run", partial: "Continue", outdated: "Run again" };
+const RUN_TEXTS = { none: "Start the run", partial: "Continue the run", outdated: "Run again" };
 
 /** @param {any} project */
 function sentence({ run, sites }) {
@@ -81,6 +81,7 @@ function drawRanking(ranking) {
   const at = ranking.poles.findIndex((/** @type {any} */ pole) => siteOf(pole.pole) === data.selected);
   if (data.selected !== listed) turnTo("ranking", at);
   listed = data.selected;
+  const best = new Map(ranking.sites.map((/** @type {any} */ site) => [site.site, site]));
   return h("section", {}, h("h2", {}, ranking.outdated ? "Ranking before the changes" : "Ranking"),
     (ranking.text ?? []).map((/** @type {string} */ sentence) => h("p", {}, sentence)),
     pagedTable({
@@ -90,8 +91,8 @@ function drawRanking(ranking) {
         { title: "Pole", isHead: true, cell: (pole) => h("button.link", {
           type: "button", "data-key": `rank.${pole.pole}`, "aria-pressed": String(siteOf(pole.pole) === data.selected), onclick: () => choosePole(siteOf(pole.pole)),
         }, pole.pole) },
-        { title: "Height, m", isNumber: true, cell: (pole) => readable(pole.height_m, 1) },
-        { title: ranking.label, isNumber: true, cell: (pole) => pole.score_text },
+        { title: "Height, m", isNumber: true, cell: (pole) => readable(best.get(pole.site)?.z_m, 1) },
+        { title: capitalised(ranking.label), isNumber: true, cell: (pole) => pole.score_text },
       ],
     }));
 }

@@ -2,6 +2,7 @@
 import { h, s } from "./dom.js";
 import { numberField } from "./fields.js";
 import { readable } from "./numbers.js";
+import { bendOf } from "./arrows.js";
 import { change, data, isBusy } from "./store.js";
 
 const SIZE = 76;
@@ -46,7 +47,7 @@ function stage(phase) {
     const isGreen = phase.green.includes(movement.index ?? number);
     if (isGreen) names.push(`${movement.approach} ${movement.turn}`);
     const [from, via, to] = [movement.from_m, movement.via_m, movement.to_m].map(at);
-    const bend = [0, 1].map((axis) => 2 * via[axis] - (from[axis] + to[axis]) / 2);
+    const bend = bendOf(from, via, to);
     const angle = Math.atan2(to[1] - bend[1], to[0] - bend[0]);
     const corner = (/** @type {number} */ turn) => `${to[0] + 5 * Math.cos(angle + turn)} ${to[1] + 5 * Math.sin(angle + turn)}`;
     return s(`g${isGreen ? ".green" : ".waits"}`, {}, s("path.line", { d: `M${from.join(" ")}Q${bend.join(" ")} ${to.join(" ")}` }),

@@ -2,6 +2,7 @@
 import { get, post, request } from "./api.js";
 import { h, show } from "./dom.js";
 import { button, choiceField, numberField, pagedTable, radioField, textInput, turnTo } from "./fields.js";
+import { shortTitle } from "./junctions.js";
 import { readable } from "./numbers.js";
 import { attempt, change, data, isBusy, runJob, say, update } from "./store.js";
 
@@ -136,14 +137,14 @@ function drawJunctions(panel) {
       choice.filter = text;
       redraw();
     } }),
-    pagedTable({
+    h("div.short", {}, pagedTable({
       key: "junctions", caption: "Junctions of the map, largest first", rows, redraw, isSelected: (row) => row.id === data.selected,
       columns: [
-        { title: "Junction", isHead: true, cell: (row) => pick(row.title, row.id) },
+        { title: "Junction", isHead: true, cell: (row) => pick(shortTitle(row.title), row.id) },
         { title: "Arms", isNumber: true, cell: (row) => row.arms },
         { title: "Signals", cell: (row) => (row.signalised ? "yes" : "no") },
       ],
-    }),
+    })),
     h("h2", {}, "New scenario"),
     textInput({ key: "name", label: "Name", text: choice.name, send(text) {
       choice.name = text.trim();
@@ -186,8 +187,7 @@ async function make(junction) {
   location.hash = "poles";
   const job = await runJob("new", body);
   if (job) {
-    const notes = job.result?.notes ?? [];
     update({ upload: null });
-    say(notes.length ? notes.join(" ") : "The scenario is ready. Look at the poles next.");
+    say("The scenario is ready.");
   }
 }

@@ -64,7 +64,7 @@ export function say(text, kind = "info") {
   box.className = kind;
   const close = h("button", { type: "button", "aria-label": "Close the message", onclick: () => say("") }, "×");
   show(box, text && [h("p", {}, text), close]);
-  if (kind === "info" && text) messageTimer = setTimeout(() => say(""), 8000);
+  if (kind === "info" && text) messageTimer = setTimeout(() => say(""), 6000);
 }
 
 /** Tell a screen reader. @param {string} text */
