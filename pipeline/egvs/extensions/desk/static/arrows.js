@@ -1,0 +1,9 @@
+// Shape of the arrows of movements.
+
+/**
+ * Where a curve from one point to another bends: towards the middle of the junction, but not all the way.
+ * @param {number[]} from @param {number[]} via @param {number[]} to
+ */
+export function bendOf(from, via, to) {
+  return [0, 1].map((axis) => 0.6 * via[axis] + 0.2 * (from[axis] + to[axis]));
+}
