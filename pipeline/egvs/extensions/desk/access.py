@@ -106,8 +106,9 @@ def _values(scope: Message, name: bytes) -> list[bytes]:
 
 
 def _query_key(scope: Message) -> bytes:
+    query: bytes = scope["query_string"]
     try:
-        return dict(parse_qsl(scope["query_string"].decode("ascii"))).get(KEY_PARAMETER, "").encode()
+        return dict(parse_qsl(query.decode("ascii"))).get(KEY_PARAMETER, "").encode("utf-8", "surrogateescape")
     except ValueError:
         return b""
 

@@ -26,7 +26,7 @@ def desk(
     from egvs.extensions.desk.serving import serve
 
     if not folder.is_dir():
-        raise InputError(folder, "no such folder", "Give a folder for your scenarios, such as the present one: egvs desk.")
+        raise InputError(folder, "no such folder", "Give a folder for your scenarios; egvs desk opens the present one.")
     listening = _listen(port)
 
     def announce(address: str) -> None:

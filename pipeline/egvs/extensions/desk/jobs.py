@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
 import subprocess
@@ -32,6 +33,13 @@ def start_worker(request: dict[str, Any]) -> subprocess.Popen[str]:
     return process
 
 
+def _close_pipes(process: subprocess.Popen[str]) -> None:
+    for pipe in (process.stdin, process.stdout, process.stderr):
+        if pipe is not None:
+            with contextlib.suppress(OSError):  # of a line that the ended process did not read
+                pipe.close()
+
+
 class Job:
     """A job and its state.
 
@@ -45,13 +53,15 @@ class Job:
         Called with each event.
     finish
         Called with the result in the end if it is done; returns the result for the page.
+    fail
+        Called with the reason if it is not done.
     """
 
     def __init__(
         self, number: int, kind: str, title: str, request: dict[str, Any], publish: Publish,
-        finish: Callable[[dict[str, Any]], dict[str, Any]],
+        finish: Callable[[dict[str, Any]], dict[str, Any]], fail: Callable[[str], None],
     ) -> None:  # fmt: skip
-        self._publish, self._finish = publish, finish
+        self._publish, self._finish, self._fail = publish, finish, fail
         self._log: deque[str] = deque(maxlen=_LOG_LINES)
         self._begin_s = self._part_begin_s = time.monotonic()
         self._is_stopped = False
@@ -104,6 +114,7 @@ class Job:
             self._publish("job", self.to_json())
         self._process.wait()
         self._threads[0].join(_END_S)
+        _close_pipes(self._process)
         final: dict[str, Any] = {"elapsed_s": round(time.monotonic() - self._begin_s, 1), "remaining_s": None}
         if "result" in end:
             try:
@@ -115,6 +126,8 @@ class Job:
         else:
             unexplained = self._log[-1] if self._log else f"it ended with code {self._process.returncode}"
             final |= {"state": "failed", "message": end.get("error", unexplained), "hint": end.get("hint", "")}
+        if final["state"] != "done":
+            self._fail(final["message"])
         self._values |= final
         self._publish("job", self.to_json())
 
@@ -142,7 +155,7 @@ class LiveScores:
         self._changed = threading.Condition()
         self._request: dict[str, Any] | None = None
         self._process: subprocess.Popen[str] | None = None
-        self._is_busy = False
+        self._threads: list[threading.Thread] = []
 
     def request(self, run: dict[str, Any], request: dict[str, Any]) -> None:
         """Ask for a score; an earlier request that has not begun is dropped."""
@@ -150,8 +163,12 @@ class LiveScores:
             self._request = request
             if self._process is None or self._process.poll() is not None:
                 self._process = start_worker({**run, "kind": "live"})
-                for target in (self._serve, self._drain):
-                    threading.Thread(target=target, args=(self._process,), daemon=True).start()
+                targets = (self._serve, self._drain)
+                self._threads = [
+                    threading.Thread(target=target, args=(self._process,), daemon=True) for target in targets
+                ]
+                for thread in self._threads:
+                    thread.start()
             self._changed.notify_all()
 
     def close(self) -> None:
@@ -162,6 +179,9 @@ class LiveScores:
         if process is not None:
             process.kill()
             process.wait()
+            for thread in self._threads:
+                thread.join(_END_S)
+            _close_pipes(process)
 
     def _serve(self, process: subprocess.Popen[str]) -> None:
         assert process.stdin is not None and process.stdout is not None
@@ -179,8 +199,11 @@ class LiveScores:
                 request, self._request = self._request, None
                 if self._process is not process:
                     return
-            process.stdin.write(json.dumps(request) + "\n")
-            process.stdin.flush()
+            try:
+                process.stdin.write(json.dumps(request) + "\n")
+                process.stdin.flush()
+            except OSError:  # it was ended meanwhile
+                return
 
     def _drain(self, process: subprocess.Popen[str]) -> None:
         assert process.stderr is not None

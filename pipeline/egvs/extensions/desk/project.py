@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import math
 import re
 import threading
 from collections.abc import Callable
@@ -17,11 +18,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomlkit
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, limits
 from egvs.core.errors import EgvsError, InputError
+from egvs.core.numbers import number_or_nan
 from egvs.extensions.desk import map_view, results_view, traffic_view
 from egvs.extensions.desk.pole_check import PoleCheck, kerb_positions
 from egvs.extensions.desk.refusals import RefusalError, parse_number, require_text
@@ -168,7 +171,9 @@ class Project:
                 if present == self._contents:
                     return False
                 self._note_step("changes on disk", present)
-                self._scenario, self._problem = load(self.folder), ""
+                scenario = load(self.folder)
+                sites.candidate_sites(scenario)
+                self._scenario, self._problem = scenario, ""
             except (EgvsError, OSError, ValueError) as error:
                 changed, self._problem = str(error) != self._problem, str(error)
                 return changed
@@ -185,7 +190,7 @@ class Project:
         for name, text in contents.items():
             files.write_text(self.folder / name, text)
 
-    def _change(self, label: str, after: Contents) -> None:
+    def _change(self, label: str, after: Contents, field_name: str = "") -> None:
         """Write files, and check that the scenario can be read; else write the former ones, and refuse."""
         changed = {name: text for name, text in after.items() if self._contents.get(name) != text}
         if not changed:
@@ -197,7 +202,9 @@ class Project:
             sites.candidate_sites(scenario)
         except EgvsError as error:
             self._write(before)
-            raise RefusalError.of(error) from None
+            refusal = RefusalError.of(error, field_name)
+            refusal.content["message"] = refusal.content["message"].replace(f"{self.folder}/", "")
+            raise refusal from None
         self._scenario, self._problem = scenario, ""
         self._note_step(label, {**self._contents, **changed})
 
@@ -219,7 +226,9 @@ class Project:
             target.append(step)
             self._contents = self._read()
             try:
-                self._scenario, self._problem = load(self.folder), ""
+                scenario = load(self.folder)
+                sites.candidate_sites(scenario)
+                self._scenario, self._problem = scenario, ""
             except EgvsError as error:  # the step was an edit by hand
                 self._problem = str(error)
 
@@ -273,9 +282,10 @@ class Project:
                 raise RefusalError(409, f"there is a pole {new_name!r}", "Choose another name.", "site")
             self._fill(table, row, {key: value for key, value in body.items() if key not in ("site", *_FLAGS)})
             row["site"] = new_name
-            self._set_flags(document, name, new_name, body)
+            self._set_flags(document, name, new_name, body, row)
             after = {**self._contents, self._sites_file(): table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
-            self._change(f"{'move' if is_moved and len(body) <= 2 else 'edit'} {name}", after)
+            label = f"{'move' if is_moved and len(body) <= 2 else 'edit'} {name}"
+            self._change(label, after, "site" if new_name != name else next(iter(body), ""))
 
     def remove_site(self, name: str) -> None:
         """Remove a pole."""
@@ -285,7 +295,7 @@ class Project:
                 raise RefusalError(404, f"there is no pole {name!r}")
             table.rows.remove(rows[name])
             document = tomlkit.parse(self._contents[SCENARIO_FILE])
-            self._set_flags(document, name, name, dict.fromkeys(_FLAGS, False))
+            self._set_flags(document, name, name, dict.fromkeys(_FLAGS, False), {})
             after = {**self._contents, self._sites_file(): table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
             self._change(f"remove {name}", after)
 
@@ -325,7 +335,7 @@ class Project:
             else:
                 raise RefusalError(422, f"{key[:40]!r} cannot be set for a pole", "", key[:40])
 
-    def _set_flags(self, document: Any, name: str, new_name: str, body: dict[str, Any]) -> None:
+    def _set_flags(self, document: Any, name: str, new_name: str, body: dict[str, Any], row: dict[str, str]) -> None:
         """Set whether a pole exists, must or must not be used, and its name where these are listed."""
         existing = self._scenario.sites.existing_poles
         if existing == "all" and (body.get("exists") is False or new_name != name):
@@ -339,7 +349,7 @@ class Project:
             if not isinstance(wanted, bool):
                 raise RefusalError(422, f"expected true or false for {flag}", "", flag)
             if flag == "must" and wanted and name not in names:
-                self._check_one_candidate(name)
+                self._check_one_candidate(name, row)
             others = [each for each in names if each != name]
             if wanted:
                 position = names.index(name) if name in names else len(others)
@@ -347,10 +357,13 @@ class Project:
             if others != names:
                 document.setdefault(table, tomlkit.table())[key] = others
 
-    def _check_one_candidate(self, name: str) -> None:
-        of_pole = [site for site in sites.candidate_sites(self._scenario) if site.pole == name]
-        if len(of_pole) > 1:
-            problem = f"{name} has {len(of_pole)} candidates: heights and tilts"
+    def _check_one_candidate(self, name: str, row: dict[str, str]) -> None:
+        """Refuse where a pole has several heights or tilts: a plan must know which one it is."""
+        config = self._scenario.sites
+        heights = 1 if row.get("z_m") else len(config.heights_m or (0.0,))
+        tilts = 1 if row.get("pitch_deg") or not isinstance(config.pitch_deg, tuple) else len(config.pitch_deg)
+        if heights * tilts > 1:
+            problem = f"{name} has {heights * tilts} candidates: heights and tilts"
             raise RefusalError(422, problem, "Set its height and its tilt first.", "must")
 
     # ---- counts and settings
@@ -483,7 +496,7 @@ class Project:
                 "settings": {
                     "frames": settings.frames, "frame_period_s": settings.frame_period_s,
                     "warmup_s": settings.warmup_s, "seed": scenario.seed,
-                    "traffic_s": settings.frames * settings.frame_period_s,
+                    "traffic_s": None if settings.frames is None else settings.frames * settings.frame_period_s,
                 },
                 "costs": {
                     "are_given": scenario.costs.are_given, "pole_cost": scenario.costs.pole,
@@ -498,33 +511,40 @@ class Project:
         frame = geolocation.scenario_georeference(self._scenario).frame
         if frame is None:
             return None
-        ((lon_deg, lat_deg),) = frame.to_degrees([self._scenario.roi.center_m[:2]]).tolist()
+        ((lon_deg, lat_deg),) = frame.to_degrees(np.array([self._scenario.roi.center_m[:2]])).tolist()
         return {"lat_deg": lat_deg, "lon_deg": lon_deg}
 
     def _describe_sites(self) -> list[dict[str, Any]]:
-        if not self._why_no_sites():
-            path = self.folder / self._sites_file()
-            rows = [row.columns for row in site_files.read_table(path, geolocation.scenario_georeference(self._scenario))[0]]
-        else:
-            try:
-                candidates = sites.candidate_sites(self._scenario)
-            except InputError:
-                return []
-            rows = [{"site": each.pole, "x_m": each.pose.x_m, "y_m": each.pose.y_m} for each in
-                    {each.pole: each for each in candidates}.values()]  # fmt: skip
-        placement = self._scenario.placement
+        placement, existing = self._scenario.placement, self._scenario.sites.existing_poles
         described = []
-        for row in rows:
+        for row in self._site_rows():
             name, source = str(row["site"]), str(row.get("source") or "")
-            kind = name.rstrip("0123456789") if source and _OF_MAP_NAME.fullmatch(name) else ""
-            values = {key: row.get(key) or None for key in ("yaw_deg", "pitch_deg", "sensor", "z_m", "cost")}
+            numbers = {key: _number_or_none(row.get(key)) for key in (*_OPTIONAL_NUMBERS, "moved_m")}
             described.append({
-                "site": name, "x_m": float(row["x_m"]), "y_m": float(row["y_m"]), **values, "source": source,
-                "moved_m": parse_number(str(row.get("moved_m") or 0), "moved_m"), "kind": kind,
-                "exists": sites.pole_exists(name, self._scenario.sites.existing_poles),
+                "site": name, "x_m": float(row["x_m"]), "y_m": float(row["y_m"]), "source": source, **numbers,
+                "sensor": row.get("sensor") or None, "moved_m": numbers["moved_m"] or 0.0,
+                "kind": name.rstrip("0123456789") if source and _OF_MAP_NAME.fullmatch(name) else "",
+                "exists": sites.pole_exists(name, existing),
                 "must": name in placement.forced, "must_not": name in placement.excluded,
             })  # fmt: skip
         return described
+
+    def _site_rows(self) -> list[dict[str, Any]]:
+        """Return the rows of the table, else the poles of the scenario; empty where they cannot be read."""
+        try:
+            if not self._why_no_sites():
+                world = geolocation.scenario_georeference(self._scenario)
+                return [row.columns for row in site_files.read_table(self.folder / self._sites_file(), world)[0]]
+            poles = {each.pole: each for each in sites.candidate_sites(self._scenario)}
+        except InputError as error:
+            self._problem = self._problem or str(error)
+            return []
+        return [{"site": name, "x_m": each.pose.x_m, "y_m": each.pose.y_m} for name, each in poles.items()]
+
+
+def _number_or_none(value: Any) -> float | None:
+    number = number_or_nan(str(value))
+    return number if math.isfinite(number) else None
 
 
 _FLAGS = {

@@ -157,11 +157,14 @@ class Desk:
             dropped.state = "read"
             return {"map": identifier}
 
-        answer = self._start_job(
-            "junctions", f"Read {dropped.name}", {"map": str(dropped.path), "out": str(dropped.streets)}, finish
-        )
-        dropped.state = "reading"
-        return answer
+        def fail(reason: str) -> None:
+            dropped.state, dropped.message = "failed", reason
+
+        request = {"map": str(dropped.path), "out": str(dropped.streets)}
+        with self._lock:
+            self._refuse_while_running()
+            dropped.state, dropped.message = "reading", ""
+            return self._start_job("junctions", f"Read {dropped.name}", request, finish, fail)
 
     def new(self, body: Body) -> Answer:
         """Make a scenario from a map: a job."""
@@ -268,13 +271,14 @@ class Desk:
             raise RefusalError(409, f"{title} is at work.", "Wait until it has ended, or stop it.")
 
     def _start_job(
-        self, kind: str, title: str, request: Answer, finish: Callable[[Answer], Answer] = dict
-    ) -> Answer:
+        self, kind: str, title: str, request: Answer, finish: Callable[[Answer], Answer] = dict,
+        fail: Callable[[str], None] = lambda _: None,
+    ) -> Answer:  # fmt: skip
         with self._lock:
             self._refuse_while_running()
             number = 1 if self._job is None else self._job.to_json()["id"] + 1
             request = {"cwd": str(self.workspace.folder), **request}
-            self._job = Job(number, kind, title, request, self.events.publish, finish)
+            self._job = Job(number, kind, title, request, self.events.publish, finish, fail)
             self.events.publish("job", self._job.to_json())
             return {"job": self._job.to_json()}
 
@@ -477,6 +481,8 @@ def endpoint(call: Call, status: int = 200) -> Callable[[Request], Any]:
             return _refusal_response(error)
         except EgvsError as error:
             return _refusal_response(RefusalError.of(error))
+        except OSError as error:  # a file was removed, or the disk is full
+            return _refusal_response(RefusalError(409, f"{error.filename or 'a file'}: {error.strerror}"))
         is_job = status == 202 and "job" in content
         return JSONResponse(content, 202 if is_job else 200, headers={"Cache-Control": "no-store"})
 
@@ -523,8 +529,7 @@ def make_application(desk: Desk) -> Starlette:
         path = (STATIC / request.path_params.get("name", "index.html")).resolve()
         if not path.is_relative_to(STATIC.resolve()) or path.suffix not in _TYPES or not path.is_file():
             return _refusal_response(RefusalError(404, "there is no such file"))
-        response = FileResponse(path, media_type=_TYPES[path.suffix], headers={"Cache-Control": "no-cache"})
-        return response
+        return FileResponse(path, media_type=_TYPES[path.suffix], headers={"Cache-Control": "no-cache"})
 
     @contextlib.asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:

@@ -13,12 +13,11 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from egvs.core.errors import EgvsError
-from egvs.core.progress import ProgressCallback
 from egvs.extensions.desk.refusals import describe_error
 
 _INTERVAL_S = 0.15

@@ -156,7 +156,8 @@ class Workspace:
     def begin_upload(self, name: str, suffixes: tuple[str, ...]) -> Path:
         """Return where an upload is written; RefusalError for a name of another kind of file."""
         if not name.lower().endswith(suffixes):
-            raise RefusalError(415, f"{name[:80]!r} is no file of a known kind", f"Kinds: {', '.join(suffixes)}.", "name")
+            hint = f"Kinds: {', '.join(suffixes)}."
+            raise RefusalError(415, f"{name[:80]!r} is no file of a known kind", hint, "name")
         if len(self.maps) >= MOST_MAPS:
             raise RefusalError(409, f"there are {MOST_MAPS} maps already", "Start the desk again.")
         folder = self.scratch / f"upload{len(list(self.scratch.iterdir()))}"
