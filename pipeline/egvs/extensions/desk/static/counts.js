@@ -39,7 +39,7 @@ export function drawCounts(panel) {
   const { project } = data;
   if (drawnProject !== project) draft.clear();
   drawnProject = project;
-  const isAssumed = project.movements.some((/** @type {any} */ movement) => movement.assumed);
+  const isAssumed = project.assumed.some((/** @type {string} */ text) => text.startsWith("traffic"));
   show(panel,
     h("h1", {}, "Traffic"),
     project.counts_editable
@@ -113,7 +113,7 @@ function approachCard(approach, isLocked) {
     const label = `${approach.approach}, ${movement.turn || "all turns"}${movement.to ? ` to ${movement.to}` : ""}`;
     const isTwice = movements.filter((/** @type {any} */ other) => other.turn === movement.turn).length > 1;
     const row = h("div.count", { title: movement.to ? `${movement.turn} to ${movement.to}` : movement.turn },
-      s("svg.turn", { viewBox: "0 0 24 24", "aria-hidden": "true" }, s("path", { d: TURNS[movement.turn] ?? TURNS.straight })),
+      s("svg.turn", { viewBox: "0 0 24 24", "aria-hidden": "true" }, s("path", { d: TURNS[movement.turn.toLowerCase()] ?? TURNS.straight })),
       numberField({
         key: `count.${movement.index}`, label, hasUnseenLabel: true, value: movement.count_per_h, isDisabled: isLocked,
         limits: { min: 0, max: 100000 },

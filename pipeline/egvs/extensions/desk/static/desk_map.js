@@ -3,7 +3,7 @@ import { latestWins, post } from "./api.js";
 import { byId } from "./dom.js";
 import { shortTitle } from "./junctions.js";
 import { MapView } from "./mapview.js";
-import { announce, attempt, change, data, say, update } from "./store.js";
+import { announce, attempt, change, data, isBusy, say, update } from "./store.js";
 
 /** @typedef {import("./mapview.js").Item} Item @typedef {import("./mapview.js").Point} Point */
 
@@ -98,7 +98,7 @@ function deskItems() {
     const score = pole ? `, rank ${pole.rank}: ${pole.score_text}` : sensor ? `, sensor ${sensor.order}` : "";
     return {
       id: site.site, at_m: [site.x_m, site.y_m], label: site.site, kind: sensor ? "sensor" : "pole", classes,
-      movable: project.sites_editable && data.job?.state !== "runs", text: sensor ? String(sensor.order) : pole && pole.rank <= 9 ? String(pole.rank) : "",
+      movable: project.sites_editable && !isBusy(), text: sensor ? String(sensor.order) : pole && pole.rank <= 9 ? String(pole.rank) : "",
       title: `${site.site}, ${kindOf(site)}${moved}${score}`,
     };
   });
@@ -115,7 +115,7 @@ function obstacleItem(obstacle) {
   const corners = [[l, w], [-l, w], [-l, -w], [l, -w]];
   return {
     id: `obstacle ${obstacle.name}`, at_m: [obstacle.x_m, obstacle.y_m], label: obstacle.name, kind: "obstacle", title: `obstacle ${obstacle.name}`,
-    movable: data.job?.state !== "runs", outline_m: corners.map(([x, y]) => [x * Math.cos(yaw) - y * Math.sin(yaw), x * Math.sin(yaw) + y * Math.cos(yaw)]),
+    movable: !isBusy(), outline_m: corners.map(([x, y]) => [x * Math.cos(yaw) - y * Math.sin(yaw), x * Math.sin(yaw) + y * Math.cos(yaw)]),
   };
 }
 
@@ -194,8 +194,8 @@ const dragged = latestWins(async (/** @type {{id: string, at_m: Point}} */ { id,
   const answer = await attempt(() => post("sites/check", { x_m, y_m, site: id }));
   const map = mapView();
   if (!answer || map.moving?.id !== id) return;
-  map.hint(answer.ok ? "" : answer.message, !answer.ok);
-  const site = answer.ok && data.step !== "poles" ? candidateOf(id) : null;
+  const site = answer.ok ? candidateOf(id) : null;
+  if (!site || !map.isFine) map.hint(answer.message ?? "", !answer.ok);
   request += 1;
   if (site) await attempt(() => post("score", { site, x_m, y_m, request }), () => undefined);
 });

@@ -88,12 +88,15 @@ function draw(changed) {
   keepingFocus(byId("stage"), drawDiagram);
 }
 
+/** Steps back and forth wait for one another. @type {Promise<void>} */
+let steps = Promise.resolve();
+
 /** @param {"undo"|"redo"} name */
 function stepBack(name) {
-  if (data.project?.[name] && !isBusy()) {
-    const what = data.project[name];
-    change("POST", name).then((state) => state && say(`${name === "undo" ? "Undone" : "Done again"}: ${what}.`));
-  }
+  steps = steps.then(async () => {
+    const what = data.project?.[name];
+    if (what && !isBusy() && (await change("POST", name))) say(`${name === "undo" ? "Undone" : "Done again"}: ${what}.`);
+  });
 }
 
 /** @param {KeyboardEvent} event */

@@ -34,6 +34,8 @@ const FINE_STEP_M = 0.1;
 const DRAG_STARTS_PX = 4;
 const KEYS_REST_MS = 600;
 const MAX_LABELS = 40;
+const MAX_LABELS_NARROW = 8;
+const NARROW_PX = 600;
 /** @type {Record<string, Point>} */
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
@@ -59,6 +61,7 @@ export class MapView {
     /** @type {{id: string, at_m: Point}|null} */ this.moving = null;
     /** @type {Point|null} */ this.refusal_m = null;
     this.hinted = false;
+    this.isFine = false;
     this.isAdding = false;
     /** @type {Point|null} */ this.cross_m = null;
     this.center_m = /** @type {Point} */ ([0, 0]);
@@ -148,7 +151,7 @@ export class MapView {
   setItems(items, selected = this.selected) {
     this.items = items;
     this.selected = items.some((item) => item.id === selected) ? selected : null;
-    const showLabels = items.filter((item) => item.kind !== "junction").length <= MAX_LABELS;
+    const showLabels = items.filter((item) => item.kind !== "junction").length <= (this.width < NARROW_PX ? MAX_LABELS_NARROW : MAX_LABELS);
     this.symbols = new Map(items.map((item) => [item.id, this.symbol(item, showLabels)]));
     show(this.marks, [...this.symbols.values()]);
     show(this.outlines, items.filter((item) => item.outline_m).map((item) =>
@@ -276,6 +279,7 @@ export class MapView {
   hint(text, isRefused) {
     if (!this.moving) return;
     this.hinted = true;
+    this.isFine = !isRefused;
     this.bubble.textContent = text;
     this.bubble.hidden = !text;
     this.bubble.classList.toggle("fine", !isRefused);
@@ -284,7 +288,7 @@ export class MapView {
   }
 
   clearRefusal() {
-    this.hinted = false;
+    this.hinted = this.isFine = false;
     this.refusal_m = null;
     this.bubble.hidden = true;
     show(this.extra);

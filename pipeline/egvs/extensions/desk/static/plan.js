@@ -25,7 +25,7 @@ export function drawPlan(panel) {
   show(panel,
     h("h1", {}, "Decide"),
     hasResults
-      ? h("p.todo", {}, plan ? "The best poles for these sensors. Try other numbers." : "How many sensors? The best poles for them follow.")
+      ? h("p.todo", {}, !plan ? "How many sensors? The best poles for them follow." : plan.outdated ? "Something has changed since. Find the plan again, or undo the change." : "The best poles for these sensors. Try other numbers, or drag a sensor to see its score.")
       : h("p.todo", {}, "Run first: the plan needs the scores of the poles."),
     hasResults && chooser(),
     plan && drawResult(plan),
@@ -99,7 +99,7 @@ function drawResult(plan) {
   return h("section", {},
     h("h2", {}, plan.outdated ? "Plan before the changes" : `${plan.sensors.length} ${plan.sensors.length === 1 ? "sensor" : "sensors"}: ${plan.score_text} ${plan.label}`),
     h("p.quiet", {}, `${capitalised(plan.certificate_text)}.`, hasCost && ` Costs ${readable(plan.cost)}.`),
-    h("ol.sensors", {}, plan.sensors.map((/** @type {any} */ sensor) => sensorItem(sensor, plan.unit === "%" ? " percentage points" : ` ${plan.unit}`))),
+    h("ol.sensors", {}, plan.sensors.map((/** @type {any} */ sensor) => sensorItem(sensor, ` ${plan.change_unit}`))),
     curve(plan),
     h("div.tools", {}, button(data.keptPlan ? "Compare with this one instead" : "Keep, to compare with another", () => update({ keptPlan: plan }), { key: "keep" })));
 }

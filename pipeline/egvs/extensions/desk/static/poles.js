@@ -29,7 +29,7 @@ export function drawPoles(panel) {
       button("Add a pole", () => update({ isAdding: !data.isAdding }), { isDisabled: isLocked, pressed: data.isAdding }),
       button(data.suggestions ? "Hide kerb positions" : "Show kerb positions", showKerbs, { key: "kerbs", isDisabled: isLocked })),
     data.isAdding && h("p.quiet", {}, "Click on the map where it stands. Or go to the map, move the cross with the arrow keys, and press Enter."),
-    data.suggestions && h("p.quiet", {}, data.suggestions.length ? "Click a ring on the map to add a pole there." : "There is no free position at the kerbs."),
+    data.suggestions && h("p.quiet", {}, data.suggestions.length ? "Click a ring on the map to add a pole there." : "No other position at the kerbs is free."),
     chosen && details(chosen, isLocked),
     sites.length > 0 && h("h2", {}, `${sites.length} candidates`),
     sites.length > 0 && pagedTable({
@@ -56,7 +56,9 @@ function assumptions({ assumed, notes }) {
 async function showKerbs() {
   if (data.suggestions) return update({ suggestions: null });
   const answer = await attempt(() => get("suggestions"));
-  if (answer) update({ suggestions: answer.poles });
+  if (!answer) return;
+  const isFree = (/** @type {any} */ pole) => data.project.sites.every((/** @type {any} */ site) => Math.hypot(site.x_m - pole.x_m, site.y_m - pole.y_m) > 1);
+  update({ suggestions: answer.poles.filter(isFree) });
 }
 
 /** @param {any} site @param {boolean} isLocked */

@@ -23,7 +23,7 @@ let lastSpoken = "";
 export function drawJob() {
   const box = byId("job");
   const { job } = data;
-  const runs = job?.state === "runs";
+  const runs = job?.state === "runs" && job.kind !== "live";
   if (!box.firstChild) show(box, h("div.line", {}, title, what, bar, time, stop), log);
   box.hidden = !runs;
   if (!runs) {

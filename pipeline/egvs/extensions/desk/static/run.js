@@ -81,7 +81,6 @@ function drawRanking(ranking) {
   const at = ranking.poles.findIndex((/** @type {any} */ pole) => siteOf(pole.pole) === data.selected);
   if (data.selected !== listed) turnTo("ranking", at);
   listed = data.selected;
-  const best = new Map(ranking.sites.map((/** @type {any} */ site) => [site.site, site]));
   return h("section", {}, h("h2", {}, ranking.outdated ? "Ranking before the changes" : "Ranking"),
     (ranking.text ?? []).map((/** @type {string} */ sentence) => h("p", {}, sentence)),
     pagedTable({
@@ -91,7 +90,7 @@ function drawRanking(ranking) {
         { title: "Pole", isHead: true, cell: (pole) => h("button.link", {
           type: "button", "data-key": `rank.${pole.pole}`, "aria-pressed": String(siteOf(pole.pole) === data.selected), onclick: () => choosePole(siteOf(pole.pole)),
         }, pole.pole) },
-        { title: "Height, m", isNumber: true, cell: (pole) => readable(best.get(pole.site)?.z_m, 1) },
+        { title: "Best mount", cell: (pole) => pole.mount_text },
         { title: capitalised(ranking.label), isNumber: true, cell: (pole) => pole.score_text },
       ],
     }));

@@ -71,8 +71,7 @@ async function readMap(id) {
   const upload = await attempt(() => get(`maps/${encodeURIComponent(id)}`));
   if (!upload) return;
   choice.name = nameOf(upload.name);
-  const { lamp = 0, signal = 0, pole = 0 } = upload.streets.poles ?? {};
-  choice.poles = lamp + signal + pole > 0 ? "existing" : "kerbs";
+  choice.poles = "existing";
   choice.filter = "";
   update({ upload, selected: upload.streets.junctions[0]?.id ?? null });
 }
@@ -124,7 +123,7 @@ const chosenJunction = () => data.upload.streets.junctions.find((/** @type {any}
 /** @param {HTMLElement} panel */
 function drawJunctions(panel) {
   const { upload } = data;
-  const { junctions, poles } = upload.streets;
+  const { junctions } = upload.streets;
   const words = choice.filter.toLowerCase();
   const rows = junctions.filter((/** @type {any} */ junction) => junction.title.toLowerCase().includes(words));
   turnTo("junctions", rows.findIndex((/** @type {any} */ junction) => junction.id === data.selected));
@@ -149,7 +148,13 @@ function drawJunctions(panel) {
     textInput({ key: "name", label: "Name", text: choice.name, send(text) {
       choice.name = text.trim();
     } }),
-    polesChoice(poles, redraw),
+    radioField({
+      name: "poles", label: "Candidates to begin with", value: choice.poles,
+      choices: [["existing", "Poles of the map", "Street lamps, signal masts and utility poles."], ["kerbs", "New poles at the kerbs", "About every 10 m."]],
+      send(value) {
+        choice.poles = value;
+      },
+    }),
     choiceField({ key: "traffic", label: "Traffic, until you type counts", value: choice.traffic, choices: [["light", "light"], ["medium", "medium"], ["heavy", "heavy"]], send(value) {
       choice.traffic = value;
     } }),
@@ -163,29 +168,16 @@ function pick(text, id) {
   return h("button.link", { type: "button", "data-key": `pick.${id}`, "aria-pressed": String(id === data.selected), onclick: () => update({ selected: id }) }, text);
 }
 
-/** @param {{lamp: number, signal: number, pole: number}|null} poles @param {() => void} redraw */
-function polesChoice(poles, redraw) {
-  const { lamp = 0, signal = 0, pole = 0 } = poles ?? {};
-  const sum = lamp + signal + pole;
-  return radioField({
-    name: "poles", label: "Candidates to begin with", value: choice.poles,
-    choices: [
-      ["existing", "Poles of the map", sum ? `The whole map has ${lamp} lamps, ${signal} signal masts and ${pole} other poles.` : "This map has none."],
-      ["kerbs", "New poles at the kerbs", "About every 10 m."],
-    ],
-    send(value) {
-      choice.poles = value;
-      redraw();
-    },
-  });
-}
-
 /** @param {any} junction */
 async function make(junction) {
   if (data.start.scenarios.some((/** @type {any} */ other) => other.name === choice.name)) return say(`“${choice.name}” exists already. Choose another name.`, "error");
   const body = { map: data.upload.id, name: choice.name, at: junction.at, poles: choice.poles, traffic: choice.traffic };
   location.hash = "poles";
-  const job = await runJob("new", body);
+  const job = await runJob("new", body, (error) => {
+    if (choice.poles === "existing" && !error.field) choice.poles = "kerbs"; // most often, the map has no poles there
+    update({ upload: data.upload });
+    say(error.message, "error");
+  });
   if (job) {
     update({ upload: null });
     say("The scenario is ready.");

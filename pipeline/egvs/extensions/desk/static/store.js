@@ -98,6 +98,7 @@ export function takeState(state) {
   const isOther = state.project?.id !== data.project?.id;
   update({ revision: state.revision, project: state.project, job: state.job });
   if (state.job?.log) update({ log: state.job.log });
+  if (isOther) resultsKey = "";
   if (isOther) update({ map: null, ranking: null, plan: null, suggestions: null, selected: null, isAdding: false, keptPlan: null, whatIf: null });
   if (state.project) refreshResults();
 }
@@ -108,7 +109,10 @@ let resultsKey = "";
 /** Fetch map, ranking and plan where they changed. */
 function refreshResults() {
   const { project } = data;
-  if (data.map?.key !== project.map_key) attempt(async () => update({ map: await get("map") }));
+  const ignoreIfClosed = (/** @type {ApiError} */ error) => {
+    if (data.project?.id === project.id) say(error.message, "error");
+  };
+  if (data.map?.key !== project.map_key) attempt(async () => update({ map: await get("map") }), ignoreIfClosed);
   const key = JSON.stringify([project.id, project.run]);
   if (key === resultsKey) return;
   resultsKey = key;
@@ -117,7 +121,7 @@ function refreshResults() {
     const ranking = hasRun ? await getIfAny("ranking") : null;
     const plan = hasRun && project.run.has_plan ? await getIfAny("plan") : null;
     if (data.project?.id === project.id) update({ ranking, plan, downloads: null });
-  });
+  }, ignoreIfClosed);
 }
 
 export const fetchState = () => attempt(async () => takeState(await get("state")));
@@ -183,4 +187,5 @@ export async function runJob(path, body = {}, onRefusal) {
   return job.state === "done" ? job : null;
 }
 
-export const isBusy = () => data.job?.state === "runs";
+/** Whether a job runs that changes may not disturb. */
+export const isBusy = () => data.job?.state === "runs" && data.job.kind !== "live";
