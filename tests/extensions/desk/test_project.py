@@ -245,3 +245,38 @@ def test_a_rule_of_sites_cannot_be_edited(town: Client) -> None:
 
 def test_check_says_what_the_command_says(town: Client) -> None:
     assert town.ok("GET", "/api/check") == {"errors": [], "warnings": []}
+
+
+def test_signals_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
+    (signal,) = town.project["signals"]
+    movements = town.project["movements"]
+    streets = [{movements[index]["approach"] for index in phase["green"]} for phase in signal["phases"]]
+    assert streets == [{"East Street (east)", "East Street (west)"}, {"North Street (north)", "North Street (south)"}]
+    assert signal["cycle_s"] == sum(phase["green_s"] + 5 for phase in signal["phases"])
+    phases = [{**signal["phases"][0], "green_s": "32,5"}, {**signal["phases"][1], "yellow_s": 4}]
+    (changed,) = town.ok("PUT", "/api/signals", {"name": signal["name"], "phases": phases})["project"]["signals"]
+    assert [phase["green_s"] for phase in changed["phases"]] == [32.5, signal["phases"][1]["green_s"]]
+    assert {phase["yellow_s"] for phase in changed["phases"]} == {4}
+    assert "1,East Street (east),right straight left,32.5\n" in read(tmp_path, "signals.csv")
+    phases[0]["green_s"] = "0"
+    refused = town.refused("PUT", "/api/signals", {"name": signal["name"], "phases": phases})
+    assert refused[::2] == (422, "phases.0.green_s")
+    assert town.refused("PUT", "/api/signals", {"name": signal["name"], "phases": []})[0] == 422
+    assert town.refused("PUT", "/api/signals", {"name": "no", "phases": []})[0] == 409
+
+
+def test_obstacles_are_a_table_of_the_scenario(town: Client, tmp_path: Path) -> None:
+    before = read(tmp_path, "scenario.toml")
+    lorry = {"name": "lorry1", "kind": "lorry", "x_m": 190, "y_m": "203,5", "yaw_deg": 0}
+    lorry |= {"length_m": 12, "width_m": 2.5, "height_m": 3.8}
+    assert town.ok("PUT", "/api/obstacles", {"obstacles": [lorry]})["project"]["obstacles"] == [{**lorry, "y_m": 203.5}]
+    table = load(tmp_path / "work" / "town").what_if["obstacles"]
+    assert (table.share, table.boxes[0].kind, table.boxes[0].y_m) == (1.0, "lorry1", 203.5)
+    for wrong in ([lorry, lorry], [{**lorry, "width_m": 0}], [{**lorry, "x_m": "1.234"}], [{"name": "x"}], "all", [1]):
+        assert town.refused("PUT", "/api/obstacles", {"obstacles": wrong})[0] == 422
+    assert town.refused("POST", "/api/what_if", {})[0] == 409  # there is no run
+    town.ok("PUT", "/api/obstacles", {"obstacles": []})
+    assert load(tmp_path / "work" / "town").what_if == {}
+    town.ok("POST", "/api/undo", {})
+    town.ok("POST", "/api/undo", {})
+    assert read(tmp_path, "scenario.toml") == before

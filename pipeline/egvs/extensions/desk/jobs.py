@@ -62,6 +62,7 @@ class Job:
         finish: Callable[[dict[str, Any]], dict[str, Any]], fail: Callable[[str], None],
     ) -> None:  # fmt: skip
         self._publish, self._finish, self._fail = publish, finish, fail
+        self._names: dict[str, str] = request.get("names", {})
         self._log: deque[str] = deque(maxlen=_LOG_LINES)
         self._begin_s = self._part_begin_s = time.monotonic()
         self._is_stopped = False
@@ -125,7 +126,10 @@ class Job:
             final |= {"state": "stopped", "message": "Stopped. What finished stages made is kept."}
         else:
             unexplained = self._log[-1] if self._log else f"it ended with code {self._process.returncode}"
-            final |= {"state": "failed", "message": end.get("error", unexplained), "hint": end.get("hint", "")}
+            message = end.get("error", unexplained)
+            for path, name in self._names.items():
+                message = message.replace(path, name)
+            final |= {"state": "failed", "message": message, "hint": end.get("hint", "")}
         if final["state"] != "done":
             self._fail(final["message"])
         self._values |= final
@@ -157,11 +161,16 @@ class LiveScores:
         self._process: subprocess.Popen[str] | None = None
         self._threads: list[threading.Thread] = []
 
+    @property
+    def is_open(self) -> bool:
+        """Whether a worker has the run open, or opens it."""
+        return self._process is not None and self._process.poll() is None
+
     def request(self, run: dict[str, Any], request: dict[str, Any]) -> None:
         """Ask for a score; an earlier request that has not begun is dropped."""
         with self._changed:
             self._request = request
-            if self._process is None or self._process.poll() is not None:
+            if not self.is_open:
                 self._process = start_worker({**run, "kind": "live"})
                 targets = (self._serve, self._drain)
                 self._threads = [

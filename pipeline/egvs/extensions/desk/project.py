@@ -11,6 +11,7 @@ import hashlib
 import io
 import math
 import re
+import shutil
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,11 +22,11 @@ from typing import Any
 import numpy as np
 import tomlkit
 
-from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_folder import RUNS, RunFolder
 from egvs.core import files, limits
 from egvs.core.errors import EgvsError, InputError
 from egvs.core.numbers import number_or_nan
-from egvs.extensions.desk import map_view, results_view, traffic_view
+from egvs.extensions.desk import map_view, obstacles, results_view, traffic_view
 from egvs.extensions.desk.pole_check import PoleCheck, kerb_positions
 from egvs.extensions.desk.refusals import RefusalError, parse_number, require_text
 from egvs.scenario.loading import load
@@ -261,7 +262,7 @@ class Project:
             row = {"site": name}
             table.rows.append(row)
             self._fill(table, row, {key: value for key, value in body.items() if key not in ("site", *_FLAGS)})
-            self._change(f"add {name}", {**self._contents, self._sites_file(): table.to_text()})
+            self._change(f"add {name}", {**self._contents, self.sites_file: table.to_text()})
             return name
 
     def edit_site(self, name: str, body: dict[str, Any]) -> None:
@@ -283,7 +284,7 @@ class Project:
             self._fill(table, row, {key: value for key, value in body.items() if key not in ("site", *_FLAGS)})
             row["site"] = new_name
             self._set_flags(document, name, new_name, body, row)
-            after = {**self._contents, self._sites_file(): table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
+            after = {**self._contents, self.sites_file: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
             label = f"{'move' if is_moved and len(body) <= 2 else 'edit'} {name}"
             self._change(label, after, "site" if new_name != name else next(iter(body), ""))
 
@@ -296,11 +297,25 @@ class Project:
             table.rows.remove(rows[name])
             document = tomlkit.parse(self._contents[SCENARIO_FILE])
             self._set_flags(document, name, name, dict.fromkeys(_FLAGS, False), {})
-            after = {**self._contents, self._sites_file(): table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
+            after = {**self._contents, self.sites_file: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
             self._change(f"remove {name}", after)
 
-    def _sites_file(self) -> str:
+    @property
+    def sites_file(self) -> str:
+        """Name of the table of poles."""
         return self._scenario.sites.file or ""
+
+    @property
+    def digest(self) -> str:
+        """Changes with each change of the files."""
+        return hashlib.sha256(repr(sorted(self._contents.items())).encode()).hexdigest()
+
+    def copy_files(self, target: Path) -> None:
+        """Copy the scenario, as the results of its run belong to it, whatever is changed afterwards."""
+        shutil.rmtree(target, ignore_errors=True)
+        shutil.copytree(
+            self.folder, target, ignore=lambda folder, names: [str(RUNS)] if Path(folder) == self.folder else []
+        )
 
     def _why_no_sites(self) -> str:
         name = self._scenario.sites.file
@@ -318,7 +333,7 @@ class Project:
             self.refresh()
             if reason := self._problem or self._why_no_sites():
                 raise RefusalError(409, reason)
-        table = CsvTable.parse(self._contents.get(self._sites_file(), ""))
+        table = CsvTable.parse(self._contents.get(self.sites_file, ""))
         return table, {row.get("site", "").strip(): row for row in table.rows}
 
     def _fill(self, table: CsvTable, row: dict[str, str], values: dict[str, Any]) -> None:
@@ -392,6 +407,52 @@ class Project:
         if name not in self._contents:
             return "The scenario has no table of counts."
         return ""
+
+    def set_signals(self, body: dict[str, Any]) -> None:
+        """Set green times of a signal in its table, and its yellow and all-red, which are those of all phases."""
+        with self.lock:
+            self.refresh()
+            known = {signal["name"]: signal for signal in self._describe_signals()}
+            signal = known.get(str(body.get("name")))
+            phases = body.get("phases")
+            if signal is None or not signal["editable"]:
+                raise RefusalError(409, self._problem or (signal or {}).get("reason") or "there is no such signal")
+            if not isinstance(phases, list) or len(phases) != len(signal["phases"]):
+                raise RefusalError(422, f"expected {len(signal['phases'])} phases", "", "phases")
+            document = tomlkit.parse(self._contents[SCENARIO_FILE])
+            plan: Any = document["traffic"]["signals"][signal["name"]]
+            table = CsvTable.parse(self._contents[signal["file"]])
+            for number, (given, present) in enumerate(zip(phases, signal["phases"], strict=True)):
+                for key in ("green_s", "yellow_s", "all_red_s"):
+                    value = parse_number(
+                        given.get(key), f"phases.{number}.{key}", 1.0 if key == "green_s" else 0.0, 300.0
+                    )
+                    if key == "green_s":
+                        for row in table.rows:
+                            if row.get("phase") == present["name"]:
+                                row[key] = f"{value:.12g}"
+                    elif value != present[key]:
+                        plan[key] = value
+            after = {**self._contents, signal["file"]: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
+            self._change("signals", after, "phases")
+
+    def _describe_signals(self) -> list[dict[str, Any]]:
+        movements = traffic_view.describe_movements(self._scenario, self._scene().inputs.network)["movements"]
+        tables = {name: CsvTable.parse(text).rows for name, text in self._contents.items() if name.endswith(".csv")}
+        return traffic_view.describe_signals(self._scenario, movements, tables)
+
+    @property
+    def obstacles(self) -> list[dict[str, Any]]:
+        """What could stand in the way."""
+        return obstacles.describe_obstacles(self._scenario)
+
+    def set_obstacles(self, body: dict[str, Any]) -> None:
+        """Set what could stand in the way, for ``egvs what-if``."""
+        with self.lock:
+            self.refresh()
+            document = tomlkit.parse(self._contents[SCENARIO_FILE])
+            obstacles.write_obstacles(document, body.get("obstacles"))
+            self._change("obstacles", {**self._contents, SCENARIO_FILE: tomlkit.dumps(document)}, "obstacles")
 
     def set_settings(self, body: dict[str, Any]) -> None:
         """Set keys of the scenario."""
@@ -473,9 +534,10 @@ class Project:
             scene = self._scene()
             try:
                 traffic = traffic_view.describe_movements(scenario, scene.inputs.network)
+                traffic["signals"] = self._describe_signals()
                 origin = self._origin()
             except EgvsError as error:
-                traffic, origin = traffic_view.describe_movements(scenario, None), None
+                traffic, origin = {**traffic_view.describe_movements(scenario, None), "signals": []}, None
                 self._problem = self._problem or str(error)
             settings = scenario.traffic
             return {
@@ -491,7 +553,7 @@ class Project:
                 "sensors": self._sensor_names(),
                 "sites_editable": not self._why_no_sites(), "sites_reason": self._why_no_sites(),
                 "sites": self._describe_sites(),
-                **traffic,
+                **traffic, "obstacles": self.obstacles,
                 "counts_editable": not self._why_no_counts(), "counts_reason": self._why_no_counts(),
                 "settings": {
                     "frames": settings.frames, "frame_period_s": settings.frame_period_s,
@@ -534,7 +596,7 @@ class Project:
         try:
             if not self._why_no_sites():
                 world = geolocation.scenario_georeference(self._scenario)
-                return [row.columns for row in site_files.read_table(self.folder / self._sites_file(), world)[0]]
+                return [row.columns for row in site_files.read_table(self.folder / self.sites_file, world)[0]]
             poles = {each.pole: each for each in sites.candidate_sites(self._scenario)}
         except InputError as error:
             self._problem = self._problem or str(error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,10 @@ from egvs.results.plans import SensorPlan
 from egvs.results.ranking import RankedSite, Ranking, describe_mount
 from egvs.runs import run_sources
 from egvs.scenario.model import Scenario
+from egvs.scenario.score_config import PlacementConfig
+
+_NO_SCORES = ("placement", "costs", "what_if")
+"""Beginnings of the keys of settings on which no score depends."""
 
 
 def describe_run(folder: Path, scenario: Scenario) -> dict[str, Any]:
@@ -26,15 +31,27 @@ def describe_run(folder: Path, scenario: Scenario) -> dict[str, Any]:
         record = RunRecord.read(folder)
         state["missing"] = [name for name in STAGE_NAMES if name not in record.stages]
         recorded = run_sources.recorded_scenario(folder)
-        changed = [*run_sources.compared_settings(recorded, scenario), *run_sources.changed_files(folder, recorded)]
+        settings = run_sources.compared_settings(recorded, scenario)
+        changed = [key for key in settings if not key.startswith(_NO_SCORES)]
+        changed += run_sources.changed_files(folder, recorded)
         plan = SensorPlan.read(RunFolder(folder))
     except InputError as error:
         return {**state, "state": "partial", "changed": [error.problem]}
     state["changed"] = changed
     state["state"] = "partial" if "score" in state["missing"] else "outdated" if changed else "complete"
     state["has_plan"] = plan is not None
-    state["plan_outdated"] = plan is not None and (bool(changed) or not plan.belongs_to(record.stages))
+    state["plan_outdated"] = plan is not None and (
+        bool(changed) or not plan.belongs_to(record.stages) or _placement_rules(plan.request) != _placement_rules(
+            scenario.placement.model_dump(mode="json")
+        )
+    )  # fmt: skip
     return state
+
+
+def _placement_rules(placement: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a plan must meet, without the request for one."""
+    config = PlacementConfig.model_validate({**placement, **dict.fromkeys(("count", "budget", "reach"))})
+    return config.model_dump(exclude={"refine"})
 
 
 def describe_ranking(folder: Path) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from starlette.routing import Route
 
 from egvs.core.errors import EgvsError
 from egvs.creation.assumed_traffic import TRAFFIC_LEVELS
-from egvs.extensions.desk import downloads, results_view
+from egvs.extensions.desk import downloads, obstacles, results_view
 from egvs.extensions.desk.events import Events
 from egvs.extensions.desk.jobs import Job, LiveScores
 from egvs.extensions.desk.project import Project
@@ -65,6 +65,7 @@ class Desk:
         self._live = LiveScores(self.events.publish)
         self._revision = 0
         self._three: tuple[Path, subprocess.Popen[str], str] | None = None
+        self._what_if: tuple[str, Answer] | None = None
         self._lock = threading.RLock()
 
     def close(self) -> None:
@@ -104,7 +105,7 @@ class Desk:
 
     def start(self, _body: Body) -> Answer:
         """Return what the start page lists."""
-        return {**self.workspace.describe(), "max_upload_bytes": MAX_UPLOAD_BYTES}
+        return {**self.workspace.describe(), "max_upload_bytes": MAX_UPLOAD_BYTES, "can_download": True}
 
     def open(self, body: Body) -> Answer:
         """Open a scenario."""
@@ -160,11 +161,21 @@ class Desk:
         def fail(reason: str) -> None:
             dropped.state, dropped.message = "failed", reason
 
-        request = {"map": str(dropped.path), "out": str(dropped.streets)}
+        request = {"map": str(dropped.path), "out": str(dropped.streets), "names": {str(dropped.path): dropped.name}}
         with self._lock:
             self._refuse_while_running()
             dropped.state, dropped.message = "reading", ""
             return self._start_job("junctions", f"Read {dropped.name}", request, finish, fail)
+
+    def download_map(self, body: Body) -> Answer:
+        """Download the map around a point: a job. Nothing is downloaded otherwise."""
+        at = [parse_number(body.get(key), key, -limit, limit) for key, limit in (("lat_deg", 85.0), ("lon_deg", 180.0))]
+        path = self.workspace.begin_upload("map.osm", (".osm",))
+
+        def finish(_result: Answer) -> Answer:
+            return {"map": self.workspace.add_map(f"{at[0]:.5f},{at[1]:.5f}.osm", path).identifier}
+
+        return self._start_job("download", "Download", {"at": at, "out": str(path)}, finish)
 
     def new(self, body: Body) -> Answer:
         """Make a scenario from a map: a job."""
@@ -191,7 +202,7 @@ class Desk:
 
         request = {
             "map": str(dropped.path), "folder": str(folder), "at": at, "poles": poles, "traffic": traffic,
-            "walk": body.get("walk") is True,
+            "walk": body.get("walk") is True, "names": {str(dropped.path): dropped.name},
         }  # fmt: skip
         return self._start_job("new", f"New scenario {name}", request, finish)
 
@@ -231,6 +242,14 @@ class Desk:
     def set_counts(self, body: Body) -> Answer:
         """Set counts."""
         return self._changed(lambda: self.project.set_counts(body))
+
+    def set_signals(self, body: Body) -> Answer:
+        """Set the times of a signal."""
+        return self._changed(lambda: self.project.set_signals(body))
+
+    def set_obstacles(self, body: Body) -> Answer:
+        """Set what could stand in the way."""
+        return self._changed(lambda: self.project.set_obstacles(body))
 
     def set_settings(self, body: Body) -> Answer:
         """Set keys of the scenario."""
@@ -316,6 +335,27 @@ class Desk:
         }  # fmt: skip
         return self._start_job("plan", "Plan", request, self._finish_results)
 
+    def what_if(self, _body: Body) -> Answer:
+        """Compare the ranking with that with the obstacles: a job."""
+        self._finished_run()
+        if not self.project.obstacles:
+            raise RefusalError(409, "There is no obstacle.", "Drop one on the map.")
+        digest = self.project.digest
+
+        def finish(result: Answer) -> Answer:
+            self._what_if = digest, result
+            return {}
+
+        request = {"scenario": str(self.project.folder), "table": obstacles.TABLE}
+        return self._start_job("what_if", "What if", request, finish)
+
+    def show_what_if(self, _body: Body) -> Answer:
+        """Return what the obstacles change."""
+        if self._what_if is None:
+            raise RefusalError(404, "Nothing was compared yet.", "Ask what changes.")
+        digest, result = self._what_if
+        return {"outdated": digest != self.project.digest, **result}
+
     def _finished_run(self) -> Path:
         if self.project.run_state()["state"] not in ("complete", "outdated"):
             raise RefusalError(409, "There is no finished run.", "Run the scenario first.")
@@ -336,13 +376,28 @@ class Desk:
         return {"outdated": self.project.run_state()["plan_outdated"], **plan}
 
     def score(self, body: Body) -> Answer:
-        """Ask for the score of a moved sensor; the answer is an event."""
-        if self.project.run_state()["state"] != "complete":
-            raise RefusalError(409, "Scores need a run of the present files.", "Run the scenario first.")
-        pose = {key: parse_number(body[key], key) for key in _POSE if body.get(key) not in (None, "")}
-        request = {"site": require_text(body, "site"), "pose": pose, "request": body.get("request")}
-        self._live.request({"run": str(self.project.run_folder)}, request)
-        return {}
+        """Ask for the score of a moved sensor; the answer is an event.
+
+        Scores are those of the run as it is: poles that were moved since then do not matter.
+        """
+        with self._lock:
+            project = self.project
+            state = project.run_state()
+            if state["state"] != "complete" and not (
+                self._live.is_open and set(state["changed"]) <= {project.sites_file}
+            ):
+                raise RefusalError(409, "Scores need a run of the present files.", "Run the scenario first.")
+            pose = {key: parse_number(body[key], key) for key in _POSE if body.get(key) not in (None, "")}
+            request = {"site": require_text(body, "site"), "pose": pose, "request": body.get("request")}
+            opened = {
+                "run": str(project.run_folder),
+                "scenario": str(self.workspace.scratch / "live" / project.folder.name),
+            }
+            if not self._live.is_open:
+                self._refuse_while_running()
+                project.copy_files(Path(opened["scenario"]))
+            self._live.request(opened, request)
+            return {}
 
     # ---- to take along
 
@@ -544,7 +599,11 @@ def make_application(desk: Desk) -> Starlette:
         get("/api/start", endpoint(desk.start)), get("/api/state", endpoint(desk.state)),
         post("/api/open", endpoint(desk.open)), post("/api/copy", endpoint(desk.copy)),
         post("/api/close", endpoint(desk.close_project)), post("/api/maps", upload_map),
-        post("/api/import", import_scenario), get("/api/maps/{identifier}", endpoint(desk.show_map)),
+        post("/api/import", import_scenario), post("/api/maps/download", endpoint(desk.download_map, 202)),
+        Route("/api/signals", endpoint(desk.set_signals), methods=["PUT"]),
+        Route("/api/obstacles", endpoint(desk.set_obstacles), methods=["PUT"]),
+        post("/api/what_if", endpoint(desk.what_if, 202)), get("/api/what_if", endpoint(desk.show_what_if)),
+        get("/api/maps/{identifier}", endpoint(desk.show_map)),
         post("/api/maps/{identifier}/read", endpoint(desk.read_map, 202)), post("/api/new", endpoint(desk.new, 202)),
         get("/api/map", endpoint(desk.show_scene)), get("/api/check", endpoint(desk.check)),
         get("/api/suggestions", endpoint(desk.suggestions)), post("/api/sites", endpoint(desk.add_site)),

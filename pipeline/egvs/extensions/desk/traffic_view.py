@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
+from egvs.core.numbers import number_or_nan
 from egvs.scenario.model import Scenario
+from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.traffic import capacity
 from egvs.traffic.approach_names import approach_name
 from egvs.traffic.directions import arrival_side
@@ -26,6 +29,7 @@ def describe_movements(scenario: Scenario, network: Network | None) -> dict[str,
         place: f"{per_h:,.0f} vehicles an hour exceed what {lanes} lanes can carry, {lanes * capacity.LANE_PER_H:,.0f}"
         for place, per_h, lanes in capacity.find_excess(network, names, counts)
     }
+    is_assumed = any(text.startswith("traffic") for text in scenario.assumed)
     movements = []
     approaches: dict[str, dict[str, Any]] = {}
     for index, count in enumerate(counts):
@@ -36,7 +40,8 @@ def describe_movements(scenario: Scenario, network: Network | None) -> dict[str,
         movements.append({
             "index": index, "approach": approach, "turn": movement.turn, "to": movement.way_out,
             "count_per_h": count.per_hour, "from_m": _nearest_point(edge, x_m, y_m), "via_m": [x_m, y_m],
-            "to_m": None if way_out is None else _nearest_point(way_out, x_m, y_m), "kind": count.kind,
+            "assumed": is_assumed, "kind": count.kind,
+            "to_m": None if way_out is None else _nearest_point(way_out, x_m, y_m),
             "problem": problems.get(f"{approach} {movement.turn}".strip(), ""),
         })  # fmt: skip
         lanes = edge.lanes_for(CAR)
@@ -55,3 +60,43 @@ def _nearest_point(edge: Edge, x_m: float, y_m: float) -> list[float]:
     ends_m = np.array([[lane[0, :2], lane[-1, :2]] for lane in lanes]).mean(axis=0)
     distance_m = np.hypot(*(ends_m - (x_m, y_m)).T)
     return [round(value, 2) for value in ends_m[distance_m.argmin()].tolist()]
+
+
+def describe_signals(
+    scenario: Scenario, movements: list[dict[str, Any]], tables: dict[str, list[dict[str, str]]]
+) -> list[dict[str, Any]]:
+    """Return the plans of signals that are in tables.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    movements
+        From :func:`describe_movements`.
+    tables
+        The rows of each table of the scenario, by its file name.
+    """
+    described = []
+    for name, plan in scenario.traffic.signals.items():
+        rows = tables.get(plan.file or "", [])
+        phases: dict[str, dict[str, Any]] = {}
+        for row in rows:
+            phase = phases.setdefault(row.get("phase", ""), {
+                "name": row.get("phase", ""), "green_s": number_or_nan(row.get("green_s", "")),
+                "yellow_s": plan.yellow_s, "all_red_s": plan.all_red_s, "green": [],
+            })  # fmt: skip
+            turns = row.get("movement", "").split()
+            phase["green"] += [
+                movement["index"]
+                for movement in movements
+                if movement["approach"] == row.get("approach") and (movement["turn"] in turns or "all" in turns)
+            ]
+        cycle_s = sum(phase["green_s"] + plan.yellow_s + plan.all_red_s for phase in phases.values())
+        if not math.isfinite(cycle_s) or not phases:
+            continue
+        described.append({
+            "name": name, "title": name, "file": plan.file, "assumed": ASSUMED_PLANS in scenario.assumed,
+            "editable": True, "reason": "", "offset_s": plan.offset_s, "cycle_s": cycle_s,
+            "phases": list(phases.values()),
+        })  # fmt: skip
+    return described

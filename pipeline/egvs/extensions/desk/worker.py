@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -58,6 +59,16 @@ def list_junctions(progress: Progress, request: dict[str, Any]) -> dict[str, Any
     return {}
 
 
+def download_map(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Download the map around a point, as ``egvs new --download``, and copy it to the file ``out``."""
+    from egvs.creation.openstreetmap import overpass
+
+    progress.report("downloads the map", 0, 0)
+    extract = overpass.download_extract((request["at"][0], request["at"][1]))
+    shutil.copyfile(extract.path, request["out"])
+    return {"note": extract.note}
+
+
 def create(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
     """Make a scenario, as ``egvs new``."""
     from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
@@ -102,6 +113,29 @@ def plan(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
     return {}
 
 
+def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Compare the ranking with that with obstacles, as ``egvs what-if``."""
+    from egvs.results.sensors import difference_unit, format_difference
+    from egvs.studies.what_if import what_if
+
+    result = what_if(
+        request["scenario"], names=[request["table"]], progress=progress.report, listener=progress.stage_event
+    )
+    (answer,) = result.answers
+    rows = []
+    for site in result.sites:
+        after = site.present[0]
+        row = {"pole": site.site, "before_text": result.label.with_unit(site.before), "after_text": "impossible"}
+        row["change_text"] = ""
+        if after is not None:
+            row["after_text"] = result.label.with_unit(after)
+            row["change_text"] = f"{result.label.change(after - site.before)} {result.label.change_unit}"
+        if site.site == result.best.site and answer.change is not None:
+            row["change_text"] = f"{format_difference(answer.change, result.best)} {difference_unit(result.best)}"
+        rows.append(row)
+    return {"text": [answer.conclusion(), *result.notes], "poles": rows}
+
+
 def run_command(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
     """Run a command of the command line."""
     from egvs.cli.app import app
@@ -119,7 +153,7 @@ def rate_poses(send: Send, request: dict[str, Any]) -> dict[str, Any]:
     from egvs.explore.settings import open_session
     from egvs.results.labels import SCORE_LABELS
 
-    session: Session = open_session(request["run"])
+    session: Session = open_session(request["scenario"], out=request["run"])
     label = SCORE_LABELS[session.rank_by]
     send({"ready": True})
     for line in sys.stdin:
@@ -142,7 +176,8 @@ def rate_poses(send: Send, request: dict[str, Any]) -> dict[str, Any]:
 
 
 JOBS: dict[str, Callable[[Progress, dict[str, Any]], dict[str, Any]]] = {
-    "junctions": list_junctions, "new": create, "run": run_stages, "plan": plan, "export": run_command
+    "junctions": list_junctions, "download": download_map, "new": create, "run": run_stages, "plan": plan,
+    "what_if": evaluate_obstacles, "export": run_command,
 }  # fmt: skip
 """What each kind of job calls."""
 
