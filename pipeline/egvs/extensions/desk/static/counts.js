@@ -1,5 +1,5 @@
 // The counts: numbers at the arrows of the junction's approaches, and their totals.
-import { bendOf } from "./arrows.js";
+import { bendOf, isDrawn } from "./arrows.js";
 import { byId, h, s, show } from "./dom.js";
 import { numberField } from "./fields.js";
 import { readable } from "./numbers.js";
@@ -98,7 +98,7 @@ export function drawDiagram() {
 
 /** Space around the junction for the cards. @returns {[number, number, number, number]} */
 function boxOfMovements() {
-  const points = data.project.movements.flatMap((/** @type {any} */ movement) => [movement.from_m, movement.to_m]);
+  const points = data.project.movements.filter(isDrawn).flatMap((/** @type {any} */ movement) => [movement.from_m, movement.to_m]);
   if (!points.length) return boxAround();
   const [xs, ys] = [0, 1].map((axis) => points.map((/** @type {number[]} */ point) => point[axis]));
   const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
@@ -151,7 +151,7 @@ function place() {
 /** Draw an arrow for each movement, as wide as its count. */
 function placeArrows() {
   const map = mapView();
-  const { movements } = data.project;
+  const movements = data.project.movements.filter(isDrawn);
   const most = Math.max(1, ...movements.map(countOf));
   arrows.setAttribute("viewBox", `0 0 ${map.width} ${map.height}`);
   const flows = movements.map((/** @type {any} */ movement) => {

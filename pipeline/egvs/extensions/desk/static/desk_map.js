@@ -75,9 +75,12 @@ export function boxAround() {
 
 // ---------------------------------------------------------------- items
 
+/** @param {string} text */
+const shorten = (text) => (text.length > 40 ? `${text.slice(0, 40)}…` : text);
+
 /** @param {any[]} junctions @returns {Item[]} */
 function junctionItems(junctions) {
-  return junctions.map((junction) => ({ id: junction.id, at_m: [junction.x_m, junction.y_m], label: shortTitle(junction.title).slice(0, 48), kind: "junction", classes: ["quietly"], title: junction.title }));
+  return junctions.map((junction) => ({ id: junction.id, at_m: [junction.x_m, junction.y_m], label: shorten(shortTitle(junction.title)), kind: "junction", classes: ["quietly"], title: junction.title }));
 }
 
 /** @returns {Item[]} */

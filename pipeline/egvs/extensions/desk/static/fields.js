@@ -18,6 +18,7 @@ const newId = () => `f${++lastId}`;
  * @param {Object} options
  * @param {string} options.key
  * @param {string} options.label
+ * @param {string} [options.labelMore] end of the label that only screen readers need
  * @param {boolean} [options.hasUnseenLabel]
  * @param {number|null|undefined} options.value
  * @param {import("./numbers.js").Limits} [options.limits]
@@ -54,6 +55,7 @@ export function numberField(options) {
  * @param {Object} options
  * @param {string} options.key
  * @param {string} options.label
+ * @param {string} [options.labelMore]
  * @param {boolean} [options.hasUnseenLabel]
  * @param {string} options.text
  * @param {string} [options.mode]
@@ -64,7 +66,7 @@ export function numberField(options) {
  * @param {(text: string) => void} [options.onInput]
  * @returns {HTMLElement}
  */
-export function textInput({ key, label, hasUnseenLabel, text, mode, unit, placeholder, isDisabled, send, onInput }) {
+export function textInput({ key, label, labelMore, hasUnseenLabel, text, mode, unit, placeholder, isDisabled, send, onInput }) {
   const id = newId();
   const before = refused.get(key);
   const reason = h("p.reason", { id: `${id}-reason`, hidden: !before }, before?.reason);
@@ -112,7 +114,7 @@ export function textInput({ key, label, hasUnseenLabel, text, mode, unit, placeh
   });
   if (onInput) input.addEventListener("input", () => onInput(input.value));
   return h("div.field", {},
-    h(`label${hasUnseenLabel ? ".unseen" : ""}`, { for: id }, label),
+    h(`label${hasUnseenLabel ? ".unseen" : ""}`, { for: id }, label, labelMore && h("span.unseen", {}, labelMore)),
     h("span.entry", {}, input, unit && h("span.unit", { "aria-hidden": "true" }, unit)),
     reason);
 }

@@ -66,6 +66,9 @@ function drawNext() {
     h(`button${STEPS[at].isOptional || STEPS[at].isDone(data.project) ? ".main" : ""}`, { type: "button", "data-key": "next", onclick: () => go(next.id) }, `Next: ${next.title} `, h("span", { "aria-hidden": "true" }, "→")));
 }
 
+/** Whether a job ran when the page was drawn: while it goes on, only its bar changes. */
+let wasBusy = false;
+
 /** @param {Set<string>} changed */
 function draw(changed) {
   const main = byId("main");
@@ -75,8 +78,8 @@ function draw(changed) {
   drawJob();
   keepingFocus(byId("top"), drawHeader);
   if (data.revision < 0) return;
-  if (changed.size === 1 && changed.has("job") && isBusy() && data.wasBusy === true) return;
-  data.wasBusy = isBusy();
+  if (changed.size === 1 && changed.has("job") && isBusy() && wasBusy) return;
+  wasBusy = isBusy();
   keepingFocus(panel, () => {
     if (!data.project) return drawStart(panel);
     const step = STEPS.find(({ id }) => id === data.step);

@@ -64,7 +64,7 @@ export class MapView {
     this.isFine = false;
     this.isAdding = false;
     /** @type {Point|null} */ this.cross_m = null;
-    this.center_m = /** @type {Point} */ ([0, 0]);
+    /** @type {Point} */ this.center_m = [0, 0];
     this.pxPerM = 4;
     this.width = 600;
     this.height = 400;
@@ -85,6 +85,7 @@ export class MapView {
       button("+", "Zoom in", () => this.zoom(1.5)),
       button("−", "Zoom out", () => this.zoom(1 / 1.5)),
       button("⤢", "Show everything", () => this.fit()));
+    /** @type {HTMLElement} */
     this.surface = h("div.surface", {
       tabindex: "0", role: "application", "aria-roledescription": "map", "aria-label": "Map from above",
       "aria-describedby": "map-hint",

@@ -30,6 +30,7 @@ export function drawPoles(panel) {
       button(data.suggestions ? "Hide kerb positions" : "Show kerb positions", showKerbs, { key: "kerbs", isDisabled: isLocked })),
     data.isAdding && h("p.quiet", {}, "Click on the map where it stands. Or go to the map, move the cross with the arrow keys, and press Enter."),
     data.suggestions && h("p.quiet", {}, data.suggestions.length ? "Click a ring on the map to add a pole there." : "No other position at the kerbs is free."),
+    sites.length > 0 && legend(),
     chosen && details(chosen, isLocked),
     sites.length > 0 && h("h2", {}, `${sites.length} candidates`),
     sites.length > 0 && pagedTable({
@@ -51,6 +52,11 @@ export function drawPoles(panel) {
 function assumptions({ assumed, notes }) {
   const list = (/** @type {string} */ title, /** @type {string[]} */ texts) => texts.length > 0 && [h("h2", {}, title), h("ul.notes", {}, texts.map((text) => h("li", {}, text)))];
   return (assumed.length > 0 || notes.length > 0) && h("details.card", {}, h("summary", {}, "Assumed, not measured"), list("Assumed", assumed), list("Noticed in the map", notes));
+}
+
+function legend() {
+  const key = (/** @type {string} */ name, /** @type {string} */ text) => h("li", {}, h(`i.key.${name}`), text);
+  return h("ul.legend", {}, key("existing", "existing pole"), key("new", "new pole"), key("assumed", "position assumed"));
 }
 
 async function showKerbs() {

@@ -2,7 +2,7 @@
 import { h, s } from "./dom.js";
 import { numberField } from "./fields.js";
 import { readable } from "./numbers.js";
-import { bendOf } from "./arrows.js";
+import { bendOf, isDrawn } from "./arrows.js";
 import { change, data, isBusy } from "./store.js";
 
 const SIZE = 76;
@@ -17,7 +17,7 @@ function signalCard(signal) {
   const isLocked = !signal.editable || isBusy();
   const cycle = signal.phases.reduce((/** @type {number} */ sum, /** @type {any} */ phase) => sum + phase.green_s + phase.yellow_s + phase.all_red_s, 0);
   return h("section.card", {}, h("h2", {}, "Signals"),
-    h("p.quiet", {}, `${signal.title}: cycle ${readable(cycle)} s.`, signal.assumed && " Assumed: type the real times if you know them.", !signal.editable && ` ${signal.reason}`),
+    h("p.quiet", {}, `${/^\d+$/.test(signal.title) ? "Cycle" : `${signal.title}: cycle`} ${readable(cycle)} s.`, signal.assumed && " Assumed: type the real times if you know them.", !signal.editable && ` ${signal.reason}`),
     cycleBar(signal, cycle),
     h("ol.phases", {}, signal.phases.map((/** @type {any} */ phase, /** @type {number} */ number) => h("li", {}, stage(phase),
       h("div.times", {}, ["green_s", "yellow_s", "all_red_s"].map((name) => time(signal, number, name, isLocked)))))));
@@ -37,14 +37,16 @@ function cycleBar(signal, cycle) {
 /** Small map of the junction with the arrows that are green. @param {any} phase */
 function stage(phase) {
   const { movements } = data.project;
-  const points = movements.flatMap((/** @type {any} */ movement) => [movement.from_m, movement.to_m]);
+  const drawn = movements.filter(isDrawn);
+  const points = drawn.flatMap((/** @type {any} */ movement) => [movement.from_m, movement.to_m]);
   const [xs, ys] = [0, 1].map((axis) => points.map((/** @type {number[]} */ point) => point[axis]));
   const [x, y] = [(Math.min(...xs) + Math.max(...xs)) / 2, (Math.min(...ys) + Math.max(...ys)) / 2];
   const scale = (SIZE - 16) / Math.max(1, Math.max(...xs) - Math.min(...xs), Math.max(...ys) - Math.min(...ys));
   const at = (/** @type {number[]} */ point) => [SIZE / 2 + (point[0] - x) * scale, SIZE / 2 - (point[1] - y) * scale];
+  /** @type {string[]} */
   const names = [];
-  const paths = movements.map((/** @type {any} */ movement, /** @type {number} */ number) => {
-    const isGreen = phase.green.includes(movement.index ?? number);
+  const paths = drawn.map((/** @type {any} */ movement) => {
+    const isGreen = phase.green.includes(movement.index);
     if (isGreen) names.push(`${movement.approach} ${movement.turn}`);
     const [from, via, to] = [movement.from_m, movement.via_m, movement.to_m].map(at);
     const bend = bendOf(from, via, to);
@@ -63,7 +65,7 @@ const NAMES = { green_s: "Green", yellow_s: "Yellow", all_red_s: "All red" };
 /** @param {any} signal @param {number} number @param {string} name @param {boolean} isLocked */
 function time(signal, number, name, isLocked) {
   return numberField({
-    key: `signal.${signal.name}.${number}.${name}`, label: /** @type {any} */ (NAMES)[name], unit: "s", value: signal.phases[number][name],
+    key: `signal.${signal.name}.${number}.${name}`, label: /** @type {any} */ (NAMES)[name], labelMore: `, stage ${number + 1}`, unit: "s", value: signal.phases[number][name],
     isDisabled: isLocked, limits: { min: name === "green_s" ? 1 : 0, max: 300 },
     send(value, refuse) {
       const phases = signal.phases.map((/** @type {any} */ phase, /** @type {number} */ other) => (other === number ? { ...phase, [name]: value } : phase));

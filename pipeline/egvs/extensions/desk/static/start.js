@@ -94,9 +94,12 @@ function downloadForm() {
     }, { isDisabled: isBusy() }));
 }
 
+/** @type {Record<string, string>} */
+const RUN_STATES = { complete: "has results", partial: "run not finished", outdated: "changed since its run" };
+
 /** @param {any} scenario */
 function scenarioRow(scenario) {
-  const state = { complete: "has results", partial: "run not finished", outdated: "changed since its run" }[scenario.run?.state] ?? "not run yet";
+  const state = RUN_STATES[scenario.run?.state] ?? "not run yet";
   return h("li", {}, h("div", {}, h("b", {}, scenario.name), h("small", {}, scenario.problem || scenario.description), h("small.state", {}, scenario.problem ? "cannot be opened" : state)),
     button("Open", () => open(scenario.id), { key: `open.${scenario.id}`, isDisabled: !!scenario.problem || isBusy(), title: `Open ${scenario.name}` }));
 }
