@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from egvs.creation import junctions
@@ -19,6 +20,9 @@ from egvs.world.mesh import World
 
 MARGIN_M = 150.0
 """What is farther from the region of interest is not drawn."""
+
+_ROUND = ("tree", "pole")
+"""Beginnings of kinds of solids that are convex."""
 
 MOST_SOLIDS = 4000
 """The nearest solids are drawn."""
@@ -86,18 +90,16 @@ def describe_scene(inputs: Inputs) -> dict[str, Any]:
 def _solids(world: World, window: BaseGeometry) -> Iterator[dict[str, Any]]:
     """Yield the outlines of the solids in a window, the nearest to its middle first."""
     triangles_m = world.triangles_m
-    corners_m = triangles_m[:, :, :2]
-    areas = shapely.polygons(corners_m)
-    is_drawn = shapely.area(areas) > 1e-6
+    edges_m = triangles_m[:, 1:, :2] - triangles_m[:, :1, :2]
+    is_drawn = np.abs(edges_m[:, 0, 0] * edges_m[:, 1, 1] - edges_m[:, 0, 1] * edges_m[:, 1, 0]) > 1e-6
     order = np.argsort(world.solid_of_face, kind="stable")
     starts = np.searchsorted(world.solid_of_face[order], np.arange(len(world.solids) + 1))
     outlines: list[tuple[float, dict[str, Any]]] = []
     for number, (name, kind) in enumerate(world.solids):
         faces = order[starts[number] : starts[number + 1]]
-        drawn = faces[is_drawn[faces]]
-        if kind == "ground" or not len(drawn):
+        if kind == "ground" or not len(faces):
             continue
-        outline = shapely.union_all(areas[drawn], grid_size=0.01)
+        outline = _outline(triangles_m[faces], triangles_m[faces[is_drawn[faces]]], kind)
         if not window.intersects(outline):
             continue
         z_m = triangles_m[faces][:, :, 2]
@@ -107,6 +109,17 @@ def _solids(world: World, window: BaseGeometry) -> Iterator[dict[str, Any]]:
             outlines.append((outline.distance(window.centroid), {**solid, "outline_m": ring}))
     outlines.sort(key=lambda each: each[0])
     yield from (solid for _, solid in outlines[:MOST_SOLIDS])
+
+
+def _outline(triangles_m: NDArray[np.float64], drawn_m: NDArray[np.float64], kind: str) -> BaseGeometry:
+    """Return the outline of a solid, of whose triangles some are drawn: of an extruded one that of its roof."""
+    if kind.startswith(_ROUND) or not len(drawn_m):
+        return shapely.MultiPoint(triangles_m[:, :, :2].reshape(-1, 2)).convex_hull
+    top_m = triangles_m[:, :, 2].max()
+    roof_m = drawn_m[(drawn_m[:, :, 2] == top_m).all(axis=1)]
+    if 2 * len(roof_m) == len(drawn_m):  # the other half is its floor
+        return shapely.coverage_union_all(shapely.polygons(roof_m[:, :, :2]))
+    return shapely.union_all(shapely.polygons(drawn_m[:, :, :2]))
 
 
 def _rings(area: BaseGeometry) -> list[list[Any]]:

@@ -135,6 +135,7 @@ class Project:
 
     def __post_init__(self) -> None:
         self.lock = threading.RLock()
+        self._scene_lock = threading.Lock()  # taken after the other one, if both are
         self._undo: list[Step] = []
         self._redo: list[Step] = []
         self._scenario = load(self.folder)
@@ -241,9 +242,11 @@ class Project:
         row = self._sites_table(editable=False)[1].get(str(body.get("site")), {})
         config = self._scenario.sites
         heights_m = [float(row["z_m"])] if row.get("z_m") else list(config.heights_m or (4.0,))
-        return self._scene().poles.problem(
-            str(body.get("site", "")), x_m, y_m, heights_m, row.get("sensor") or config.sensor
-        )
+        scene = self._scene()
+        with self._scene_lock:
+            return scene.poles.problem(
+                str(body.get("site", "")), x_m, y_m, heights_m, row.get("sensor") or config.sensor
+            )
 
     def _refuse_impossible(self, body: dict[str, Any], field_name: str = "x_m") -> None:
         if problem := self.check_pole(body):
@@ -506,11 +509,14 @@ class Project:
     def map(self) -> dict[str, Any]:
         """Return the map for the page."""
         scene = self._scene()
-        return _refused(lambda: {"key": scene.key, **scene.view})
+        with self._scene_lock:
+            return _refused(lambda: {"key": scene.key, **scene.view})
 
     def suggestions(self) -> dict[str, Any]:
         """Return free positions along the kerbs."""
-        return _refused(lambda: {"poles": self._scene().suggestions})
+        scene = self._scene()
+        with self._scene_lock:
+            return _refused(lambda: {"poles": scene.suggestions})
 
     @property
     def scenario(self) -> Scenario:

@@ -77,6 +77,7 @@ def describe_signals(
         The rows of each table of the scenario, by its file name.
     """
     described = []
+    title = scenario.description if len(scenario.traffic.signals) == 1 else ""
     for name, plan in scenario.traffic.signals.items():
         rows = tables.get(plan.file or "", [])
         phases: dict[str, dict[str, Any]] = {}
@@ -95,7 +96,7 @@ def describe_signals(
         if not math.isfinite(cycle_s) or not phases:
             continue
         described.append({
-            "name": name, "title": name, "file": plan.file, "assumed": ASSUMED_PLANS in scenario.assumed,
+            "name": name, "title": title or name, "file": plan.file, "assumed": ASSUMED_PLANS in scenario.assumed,
             "editable": True, "reason": "", "offset_s": plan.offset_s, "cycle_s": cycle_s,
             "phases": list(phases.values()),
         })  # fmt: skip
