@@ -110,7 +110,8 @@ def pixel(tab: Any, name: str) -> tuple[float, float]:
 
 
 def middle(element: Any) -> tuple[float, float]:
-    box = element.bounding_box()
+    while not (box := element.bounding_box()):  # it was drawn again
+        element.page.wait_for_timeout(50)
     return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
@@ -359,3 +360,51 @@ def test_plan_that_cannot_be_is_explained(open_page: Callable[..., Any], folder:
     message = tab.locator("#message.error")
     message.wait_for(timeout=JOB_MS)
     assert "budget" in message.inner_text()
+
+
+def test_signal_times_are_typed_and_checked(town: Any) -> None:
+    go(town, "Traffic")
+    times = [phase["green_s"] for phase in state(town)["project"]["signals"][0]["phases"]]
+    field = town.get_by_label("Green, stage 1", exact=True)
+    field.fill("0")
+    field.press("Enter")
+    town.get_by_text("The smallest value is 1.").wait_for()
+    field.fill("33,5")
+    field.press("Enter")
+    wait_until(town, lambda: state(town)["project"]["signals"][0]["phases"][0]["green_s"] == 33.5)
+    town.keyboard.press("Control+z")
+    wait_until(town, lambda: [phase["green_s"] for phase in state(town)["project"]["signals"][0]["phases"]] == times)
+
+
+def test_lorry_is_dropped_on_the_map(open_page: Callable[..., Any], folder: Path) -> None:
+    write_mini(folder / "mini")
+    tab = open_scenario(open_page(), "mini")
+    go(tab, "Run")
+    tab.get_by_role("button", name="Start the run").click()
+    tab.get_by_role("heading", name="Ranking").wait_for(timeout=JOB_MS)
+    go(tab, "Decide")
+    tab.get_by_role("button", name="Parked lorry").click()
+    x, y = middle(tab.locator(".outlines .obstacle"))
+    before = state(tab)["project"]["obstacles"][0]
+    drag(tab, (x, y), (x - 40, y))
+    wait_until(tab, lambda: state(tab)["project"]["obstacles"][0]["x_m"] < before["x_m"])
+    tab.get_by_role("button", name="What changes?").click()
+    table = tab.get_by_role("table", name="Scores with and without the obstacles")
+    table.wait_for(timeout=JOB_MS)
+    assert "pole_" in table.inner_text()
+    assert_accessible(tab)
+    tab.get_by_title("Remove lorry1").click()
+    wait_until(tab, lambda: state(tab)["project"]["obstacles"] == [])
+
+
+def test_scenario_is_sent_as_one_file(open_page: Callable[..., Any], folder: Path, tmp_path: Path) -> None:
+    write_mini(folder / "mini")
+    tab = open_scenario(open_page(accept_downloads=True), "mini")
+    go(tab, "Take along")
+    with tab.expect_download(timeout=JOB_MS) as download:
+        tab.get_by_title("Save Scenario").click()
+    download.value.save_as(tmp_path / "sent.zip")
+    tab.get_by_role("button", name="egvs desk").click()
+    tab.set_input_files("#map-file", tmp_path / "sent.zip")
+    wait_until(tab, lambda: (state(tab)["project"] or {}).get("name") == "sent")
+    assert (folder / "sent" / "sites.csv").read_bytes() == (folder / "mini" / "sites.csv").read_bytes()

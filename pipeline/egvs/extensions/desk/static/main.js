@@ -1,8 +1,7 @@
 // Starts the page: connects it with the server, and draws what changed.
 import { listen } from "./api.js";
 import { byId, h, keepingFocus, show } from "./dom.js";
-import { data, fetchStart, fetchState, onChange, say, takeJob, update } from "./store.js";
-import { change, isBusy } from "./store.js";
+import { change, data, fetchStart, fetchState, isBusy, onChange, say, settled, takeJob, update } from "./store.js";
 import { forgetRefused } from "./fields.js";
 import { drawJob } from "./progress.js";
 import { drawStart } from "./start.js";
@@ -30,6 +29,15 @@ function go(id) {
   visited.add(data.step);
   if (location.hash !== `#${id}`) location.hash = id;
   else readStep();
+}
+
+/** Move the focus to the heading of what was opened, so that keyboard and screen reader go on there. */
+function focusHeading() {
+  setTimeout(() => {
+    const heading = byId("panel").querySelector("h1");
+    heading?.setAttribute("tabindex", "-1");
+    heading?.focus();
+  });
 }
 
 function readStep() {
@@ -63,8 +71,14 @@ function drawNext() {
   const at = STEPS.findIndex(({ id }) => id === data.step);
   const next = STEPS[at + 1];
   return next && h("footer.next", {},
-    h(`button${STEPS[at].isOptional || STEPS[at].isDone(data.project) ? ".main" : ""}`, { type: "button", "data-key": "next", onclick: () => go(next.id) }, `Next: ${next.title} `, h("span", { "aria-hidden": "true" }, "→")));
+    h(`button${STEPS[at].isOptional || STEPS[at].isDone(data.project) ? ".main" : ""}`, { type: "button", "data-key": "next", onclick: () => {
+      go(next.id);
+      focusHeading();
+    } }, `Next: ${next.title} `, h("span", { "aria-hidden": "true" }, "→")));
 }
+
+/** Project or map that is shown. */
+let shownPage = "";
 
 /** Whether a job ran when the page was drawn: while it goes on, only its bar changes. */
 let wasBusy = false;
@@ -96,7 +110,7 @@ let steps = Promise.resolve();
 
 /** @param {"undo"|"redo"} name */
 function stepBack(name) {
-  steps = steps.then(async () => {
+  steps = steps.then(settled).then(async () => {
     const what = data.project?.[name];
     if (what && !isBusy() && (await change("POST", name))) say(`${name === "undo" ? "Undone" : "Done again"}: ${what}.`);
   });
@@ -116,6 +130,9 @@ function shortcuts(event) {
 onChange(draw);
 onChange((changed) => {
   if (changed.has("project") && !data.project) fetchStart();
+  const page = data.project?.id ?? data.upload?.id ?? "";
+  if (page !== shownPage && document.activeElement === document.body) focusHeading();
+  shownPage = page;
 });
 byId("undo").addEventListener("click", () => stepBack("undo"));
 byId("redo").addEventListener("click", () => stepBack("redo"));

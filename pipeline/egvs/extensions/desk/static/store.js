@@ -127,19 +127,29 @@ function refreshResults() {
 export const fetchState = () => attempt(async () => takeState(await get("state")));
 export const fetchStart = () => attempt(async () => update({ start: await get("start") }));
 
+/** Changes are sent one after the other. @type {Promise<any>} */
+let changes = Promise.resolve();
+
+/** Resolves when no change is on its way. */
+export const settled = () => changes;
+
 /**
  * Change the project; every change answers with the new state.
  * @param {"POST"|"PUT"|"PATCH"|"DELETE"} method
  * @param {string} path
  * @param {unknown} [body]
  * @param {(error: ApiError) => void} [onRefusal]
+ * @returns {Promise<any>} the state; null if refused
  */
-export async function change(method, path, body = {}, onRefusal) {
-  const state = await attempt(() => request(method, path, body), onRefusal);
-  if (state) {
+export function change(method, path, body = {}, onRefusal) {
+  const state = changes.then(async () => {
+    const answer = await attempt(() => request(method, path, body), onRefusal);
+    if (!answer) return null;
     say("");
-    takeState(state);
-  }
+    takeState(answer);
+    return answer;
+  });
+  changes = state.catch(() => undefined);
   return state;
 }
 
