@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from egvs.extensions.desk.server import STATIC
 from tests.accessibility import violations
 from tests.conftest import write_mini
 from tests.extensions.desk.conftest import MAP
@@ -408,3 +410,37 @@ def test_scenario_is_sent_as_one_file(open_page: Callable[..., Any], folder: Pat
     tab.set_input_files("#map-file", tmp_path / "sent.zip")
     wait_until(tab, lambda: (state(tab)["project"] or {}).get("name") == "sent")
     assert (folder / "sent" / "sites.csv").read_bytes() == (folder / "mini" / "sites.csv").read_bytes()
+
+
+def test_numbers_as_people_type_them(open_page: Callable[..., Any]) -> None:
+    expected: dict[str, float | None] = {
+        "8,5": 8.5, "8.5": 8.5, " 12 ": 12, "-3,25": -3.25, "−3": -3, "1 234,5": 1234.5, "1.234,5": 1234.5,
+        "1,234.5": 1234.5, "1.234.567": 1234567, "1234,567": 1234.567, "0.125": 0.125, "0,125": 0.125, ",5": 0.5,
+        "1.234": None, "1,234": None, "1.23.4": None, "1,2,3": None, "1e3": None, "NaN": None, "ten": None, "": None,
+        "12-": None, "1.234,": None, "12,3456": 12.3456, "-0": 0,
+    }  # fmt: skip
+    read = """async texts => {
+        const { parseNumber } = await import('/static/numbers.js');
+        return texts.map(text => { try { return parseNumber(text); } catch (error) { return null; } });
+    }"""
+    assert dict(zip(expected, open_page().evaluate(read, list(expected)), strict=True)) == expected
+
+
+def test_scripts_have_types() -> None:
+    """``tsc`` checks the types in the comments; ``npm install -g typescript`` installs it."""
+    program = shutil.which("tsc")
+    if program is None:
+        pytest.skip("no tsc on this machine")
+    scripts = sorted(str(script) for script in STATIC.glob("*.js"))
+    options = ["--noEmit", "--allowJs", "--checkJs", "--strict", "--target", "es2022", "--lib", "es2022,dom,dom.iterable"]
+    command = [program, *options, "--module", "es2022", "--moduleResolution", "bundler", *scripts]
+    checked = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stdout
+
+
+def test_page_needs_nothing_from_elsewhere() -> None:
+    for file in STATIC.iterdir():
+        text = file.read_text(encoding="utf-8").replace("http://www.w3.org/2000/svg", "")
+        assert "http" not in text.replace("http://127.0.0.1", ""), file
+        assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(|new Function", text), file
+        assert file.suffix != ".html" or not re.search(r"\sstyle=|\son[a-z]+=|<script>", text)

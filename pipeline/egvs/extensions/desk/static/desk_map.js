@@ -27,7 +27,7 @@ export function mapView() {
     onSelect: (id) => select(id),
     onMove: (id, at_m) => moveItem(id, at_m),
     onAdd: (at_m) => addPole(at_m),
-    onDelete: (id) => data.step === "poles" && removePole(id),
+    onDelete: (id) => data.step === "poles" && data.project?.sites.some((/** @type {any} */ site) => site.site === id) && removePole(id),
     onDrag: (id, at_m) => dragged({ id, at_m }),
     announce,
   });
@@ -165,10 +165,11 @@ async function moveItem(id, at_m) {
     await change("PUT", "obstacles", { obstacles });
     return;
   }
-  await change("PATCH", `sites/${encodeURIComponent(id)}`, { x_m: at_m[0], y_m: at_m[1] }, (error) => {
+  const state = await change("PATCH", `sites/${encodeURIComponent(id)}`, { x_m: at_m[0], y_m: at_m[1] }, (error) => {
     update({ project: data.project }); // puts it back
     refuse(at_m, error.reason);
   });
+  if (state) announce(`Moved ${id}.`);
 }
 
 /** @param {string} id */

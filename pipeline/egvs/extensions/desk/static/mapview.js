@@ -438,7 +438,8 @@ export class MapView {
     if (!this.items.length) return;
     const at = this.items.findIndex((item) => item.id === this.selected);
     const next = this.items[at < 0 ? 0 : (at + direction + this.items.length) % this.items.length];
-    this.choose(next.id);
+    if (next.kind === "suggestion") this.select(next.id); // Enter takes it
+    else this.choose(next.id);
     this.reveal(next.id);
     this.handlers.announce(next.title ?? next.label);
   }
