@@ -3,6 +3,7 @@ import { latestWins, post } from "./api.js";
 import { byId } from "./dom.js";
 import { shortTitle } from "./junctions.js";
 import { MapView } from "./mapview.js";
+import { saveObstacles } from "./what_if.js";
 import { announce, attempt, change, data, isBusy, say, update } from "./store.js";
 
 /** @typedef {import("./mapview.js").Item} Item @typedef {import("./mapview.js").Point} Point */
@@ -162,7 +163,7 @@ async function moveItem(id, at_m) {
   request += 1;
   if (id.startsWith("obstacle ")) {
     const obstacles = data.project.obstacles.map((/** @type {any} */ other) => (`obstacle ${other.name}` === id ? { ...other, x_m: at_m[0], y_m: at_m[1] } : other));
-    await change("PUT", "obstacles", { obstacles });
+    await saveObstacles(obstacles);
     return;
   }
   const state = await change("PATCH", `sites/${encodeURIComponent(id)}`, { x_m: at_m[0], y_m: at_m[1] }, (error) => {

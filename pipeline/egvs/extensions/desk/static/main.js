@@ -98,6 +98,7 @@ function draw(changed) {
     if (!data.project) return drawStart(panel);
     const step = STEPS.find(({ id }) => id === data.step);
     step?.draw(panel);
+    if (data.project.problem) panel.prepend(h("p.note.problem", { role: "alert" }, data.project.problem));
     const next = drawNext();
     if (next) panel.append(next);
   });

@@ -4,6 +4,7 @@ import { byId, h, show } from "./dom.js";
 import { button, numberField, pagedTable, turnTo } from "./fields.js";
 import { capitalised, duration, readable } from "./numbers.js";
 import { choosePole, siteOf } from "./desk_map.js";
+import { save } from "./take.js";
 import { attempt, change, data, isBusy, runJob, say, update } from "./store.js";
 
 /** What the files say before a run. @type {{key: string, errors: any[], warnings: any[]}|null} */
@@ -27,7 +28,7 @@ export function drawRun(panel) {
     h("div.tools", {},
       run.state !== "complete" && button(RUN_TEXTS[run.state], start, { key: "run", isMain: true, isDisabled: !canRun }),
       run.state !== "complete" && button("Check the files", check, { isDisabled: !canRun }),
-      run.state === "complete" && button("Open the report", () => openReport(), { isDisabled: isBusy() }),
+      run.state === "complete" && button("Save the report", () => save({ id: "report", title: "Report" }), { isDisabled: isBusy() }),
       run.state === "complete" && button("3D view", openThree, { isDisabled: isBusy() })),
     job?.kind === "run" && job.state === "failed" && h("p.reason", { role: "alert" }, job.message, job.hint && ` ${job.hint}`),
     checked?.key === filesKey() && problems(checked),
@@ -96,13 +97,7 @@ function drawRanking(ranking) {
     }));
 }
 
-// ---------------------------------------------------------------- report and 3D
-
-async function openReport() {
-  const answer = await attempt(() => post("downloads/report"));
-  if (answer?.url) window.open(answer.url, "_blank", "noopener");
-  else if (answer) say("The report is being written. Open it again when it is ready.");
-}
+// ---------------------------------------------------------------- 3D
 
 async function openThree() {
   const answer = await attempt(() => post("three"));

@@ -26,8 +26,8 @@ async function load() {
   if (downloads) update({ downloads });
 }
 
-/** @param {any} item */
-async function save(item) {
+/** Make a file if necessary, and save it. @param {{id: string, title: string}} item */
+export async function save(item) {
   const job = await runJob(`downloads/${encodeURIComponent(item.id)}`);
   const url = job?.result?.url;
   if (!url) return;

@@ -3,6 +3,7 @@ import { h } from "./dom.js";
 import { get } from "./api.js";
 import { button, numberField } from "./fields.js";
 import { mapView } from "./desk_map.js";
+import { capitalised } from "./numbers.js";
 import { attempt, change, data, isBusy, runJob, update } from "./store.js";
 
 /** @type {Record<string, {title: string, length_m: number, width_m: number, height_m: number}>} */
@@ -25,8 +26,10 @@ export function drawWhatIf() {
 }
 
 /** @param {any[]} obstacles @param {import("./fields.js").Refuse} [refuse] */
-export function saveObstacles(obstacles, refuse) {
-  return change("PUT", "obstacles", { obstacles }, refuse);
+export async function saveObstacles(obstacles, refuse) {
+  const state = await change("PUT", "obstacles", { obstacles }, refuse);
+  if (state) update({ whatIf: null }); // it was about the others
+  return state;
 }
 
 /** @param {string} kind */
@@ -61,7 +64,7 @@ async function compute() {
 
 /** @param {any} whatIf */
 function result(whatIf) {
-  return h("div", {}, (whatIf.text ?? []).map((/** @type {string} */ text) => h("p", {}, text)),
+  return h("div", {}, (whatIf.text ?? []).map((/** @type {string} */ text) => h("p", {}, capitalised(text))),
     h("div.table", {}, h("table", {}, h("caption.unseen", {}, "Scores with and without the obstacles"),
       h("thead", {}, h("tr", {}, ["Pole", "Before", "After", "Change"].map((title) => h("th", { scope: "col" }, title)))),
       h("tbody", {}, whatIf.poles.slice(0, 10).map((/** @type {any} */ pole) => h("tr", {}, h("th", { scope: "row" }, pole.pole), h("td", {}, pole.before_text), h("td", {}, pole.after_text), h("td", {}, pole.change_text)))))));
