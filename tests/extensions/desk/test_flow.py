@@ -181,8 +181,3 @@ def test_ends_with_its_jobs(tmp_path: Path) -> None:
     _, errors = program.communicate(timeout=60)
     assert time.monotonic() - begin_s < 30
     assert "Traceback" not in errors
-
-
-def test_command_refuses_what_it_cannot_serve(run_egvs, tmp_path: Path) -> None:
-    code, _, err = run_egvs("desk", tmp_path / "nothing", "--no-browser")
-    assert code == 2 and "no such folder" in err

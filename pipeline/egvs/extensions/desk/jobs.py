@@ -16,7 +16,15 @@ from typing import Any
 from egvs.extensions.desk.refusals import RefusalError
 
 Publish = Callable[[str, Any], None]
+STAGE_SHARES = {
+    "check": 0.1, "statics": 0.02, "scan": 0.1, "traffic": 0.2, "tpog": 0.06, "score": 0.48, "report": 0.04
+}  # fmt: skip
+"""Usual shares of the stages in the time of a run, in the order of execution."""
+
 _LOG_LINES = 200
+_LEAST_SHARE = 0.05
+"""Before so much is done, the remaining time is not known."""
+
 _END_S = 10.0
 """Time for a stopped job to end by itself."""
 
@@ -64,7 +72,7 @@ class Job:
         self._publish, self._finish, self._fail = publish, finish, fail
         self._names: dict[str, str] = request.get("names", {})
         self._log: deque[str] = deque(maxlen=_LOG_LINES)
-        self._begin_s = self._part_begin_s = time.monotonic()
+        self._begin_s = time.monotonic()
         self._is_stopped = False
         self._values: dict[str, Any] = {
             "id": number, "kind": kind, "title": title, "state": "runs", "stage": "", "what": "", "done": 0,
@@ -137,12 +145,25 @@ class Job:
 
     def _note_progress(self, stage: str, what: str, done: int, total: int) -> None:
         now_s = time.monotonic()
-        if (stage, what) != (self._values["stage"], self._values["what"]):
-            self._part_begin_s = now_s
+        share = run_share(stage, done, total) if self._values["kind"] == "run" else done / total if total else None
         remaining_s = None
-        if done and total > done:
-            remaining_s = round((now_s - self._part_begin_s) * (total - done) / done, 1)
-        self._values |= {"stage": stage, "what": what, "done": done, "total": total, "remaining_s": remaining_s}
+        if share is not None and share > _LEAST_SHARE:
+            remaining_s = round((now_s - self._begin_s) * (1.0 - share) / share, 1)
+        values = {"stage": stage, "what": what, "done": done, "total": total, "remaining_s": remaining_s}
+        self._values |= {**values, "share": share}
+
+
+def run_share(stage: str, done: int, total: int) -> float | None:
+    """Return the share of a run that is done, by the usual times of its stages; None before the first one.
+
+    >>> run_share("scan", 1, 2), run_share("", 0, 0)
+    (0.17, None)
+    """
+    if stage not in STAGE_SHARES:
+        return None
+    names = list(STAGE_SHARES)
+    before = sum(STAGE_SHARES[name] for name in names[: names.index(stage)])
+    return round(before + (STAGE_SHARES[stage] * min(done / total, 1.0) if total else 0.0), 3)
 
 
 class LiveScores:
