@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -280,3 +282,32 @@ def test_obstacles_are_a_table_of_the_scenario(town: Client, tmp_path: Path) -> 
     town.ok("POST", "/api/undo", {})
     town.ok("POST", "/api/undo", {})
     assert read(tmp_path, "scenario.toml") == before
+
+
+def packed(**files: str) -> bytes:
+    """A ZIP archive of these files, by name."""
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        for name, text in files.items():
+            archive.writestr(name, text)
+    return data.getvalue()
+
+
+def test_archives_of_others_are_checked(desk: Client, tmp_path: Path) -> None:
+    before = sorted(tmp_path.rglob("*"))
+    for archive in (
+        b"no archive",
+        packed(**{"readme.txt": "x"}),
+        packed(**{"scenario.toml": "nonsense"}),
+        packed(**{"../scenario.toml": "seed = 1"}),
+    ):
+        assert desk.refused("POST", "/api/import?name=sent.zip", archive)[0] in (415, 422)
+    assert desk.refused("POST", "/api/import?name=mini.zip", packed(**{"scenario.toml": ""}))[0] == 409
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_scenario_that_is_a_link_is_not_opened(desk: Client, tmp_path: Path) -> None:
+    path = tmp_path / "work" / "mini" / "scenario.toml"
+    path.rename(tmp_path / "elsewhere.toml")
+    path.symlink_to(tmp_path / "elsewhere.toml")
+    assert desk.refused("POST", "/api/open", {"scenario": "mini"})[0] == 409

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from egvs.core.errors import EgvsError
 from egvs.extensions.desk.refusals import RefusalError
 
 Publish = Callable[[str, Any], None]
@@ -128,8 +129,9 @@ class Job:
         if "result" in end:
             try:
                 final |= {"state": "done", "share": 1.0, "result": self._finish(end["result"])}
-            except RefusalError as error:
-                final |= {"state": "failed", "message": error.content["message"], "hint": error.content["hint"]}
+            except (RefusalError, EgvsError) as error:
+                refusal = error if isinstance(error, RefusalError) else RefusalError.of(error)
+                final |= {"state": "failed", "message": refusal.content["message"], "hint": refusal.content["hint"]}
         elif self._is_stopped:
             final |= {"state": "stopped", "message": "Stopped. What finished stages made is kept."}
         else:

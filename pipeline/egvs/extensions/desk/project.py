@@ -141,6 +141,8 @@ class Project:
         self._scenario = load(self.folder)
         self._problem = ""
         self._contents = self._read()
+        if SCENARIO_FILE not in self._contents:
+            raise RefusalError(409, f"{SCENARIO_FILE} is a link to another folder", "Open that folder.", "scenario")
         self._kept_scene: _Scene | None = None
         self._run_state: tuple[object, dict[str, Any]] = (None, {})
 

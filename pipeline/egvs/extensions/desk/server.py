@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -564,7 +565,10 @@ def make_application(desk: Desk) -> Starlette:
 
     async def import_scenario(request: Request) -> Response:
         def take(name: str, path: Path) -> Answer:
-            return desk.open({"scenario": desk.workspace.import_scenario(name, path)})
+            try:
+                return desk.open({"scenario": desk.workspace.import_scenario(name, path)})
+            finally:
+                shutil.rmtree(path.parent)
 
         return await upload(request, take, (".zip",))
 

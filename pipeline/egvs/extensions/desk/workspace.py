@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import shutil
@@ -67,6 +68,7 @@ class Workspace:
     def __init__(self, folder: Path, scratch: Path) -> None:
         self.folder, self.scratch = folder.resolve(), scratch
         self.maps: dict[str, DroppedMap] = {}
+        self._numbers = itertools.count(1)
 
     def scenario_folder(self, identifier: str) -> Path:
         """Return the folder of a scenario; RefusalError if there is none of that name."""
@@ -160,7 +162,7 @@ class Workspace:
             raise RefusalError(415, f"{name[:80]!r} is no file of a known kind", hint, "name")
         if len(self.maps) >= MOST_MAPS:
             raise RefusalError(409, f"there are {MOST_MAPS} maps already", "Start the desk again.")
-        folder = self.scratch / f"upload{len(list(self.scratch.iterdir()))}"
+        folder = self.scratch / f"upload{next(self._numbers)}"
         folder.mkdir()
         suffix = next(each for each in suffixes if name.lower().endswith(each))
         return folder / f"map{suffix}"
