@@ -11,6 +11,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +166,8 @@ def write_two_junctions(path: Path) -> Path:
     """Write the made-up town with another junction 100 m east of the first."""
     lane = (
         '<node id="9001" lat="52.0000000" lon="10.0014561"/><node id="9002" lat="52.0010000" lon="10.0014561"/>'
-        '<way id="9003"><nd ref="9001"/><nd ref="9002"/><tag k="highway" v="residential"/><tag k="name" v="Mill Lane"/></way>'
+        '<way id="9003"><nd ref="9001"/><nd ref="9002"/><tag k="highway" v="residential"/>'
+        '<tag k="name" v="Mill Lane"/></way>'
     )
     street = '<way id="1001"><nd ref="101"/><nd ref="1"/>'
     text = MAP.read_text(encoding="utf-8")
@@ -238,7 +240,9 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
     tab.get_by_role("button", name="Keep, to compare").click()
     tab.get_by_role("slider", name="Sensors").press("ArrowLeft")
     tab.get_by_role("heading", name="1 sensor:").wait_for(timeout=JOB_MS)
-    assert tab.get_by_role("table", name="The plan that was kept, and this one").locator("tbody tr").first.inner_text().split() == ["Sensors", "2", "1"]
+    assert tab.get_by_role("table", name="The plan that was kept, and this one").locator(
+        "tbody tr"
+    ).first.inner_text().split() == ["Sensors", "2", "1"]
     assert_accessible(tab)
 
     go(tab, "Take along")
@@ -432,7 +436,16 @@ def test_scripts_have_types() -> None:
     if program is None:
         pytest.skip("no tsc on this machine")
     scripts = sorted(str(script) for script in STATIC.glob("*.js"))
-    options = ["--noEmit", "--allowJs", "--checkJs", "--strict", "--target", "es2022", "--lib", "es2022,dom,dom.iterable"]
+    options = [
+        "--noEmit",
+        "--allowJs",
+        "--checkJs",
+        "--strict",
+        "--target",
+        "es2022",
+        "--lib",
+        "es2022,dom,dom.iterable",
+    ]
     command = [program, *options, "--module", "es2022", "--moduleResolution", "bundler", *scripts]
     checked = subprocess.run(command, capture_output=True, text=True, check=False)
     assert checked.returncode == 0, checked.stdout
@@ -444,3 +457,43 @@ def test_page_needs_nothing_from_elsewhere() -> None:
         assert "http" not in text.replace("http://127.0.0.1", ""), file
         assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(|new Function", text), file
         assert file.suffix != ".html" or not re.search(r"\sstyle=|\son[a-z]+=|<script>", text)
+
+
+def has_focus(tab: Any, name: str) -> bool:
+    """Return whether an element whose text begins like this has the focus."""
+    text = tab.evaluate("(document.activeElement.textContent || document.activeElement.ariaLabel || '').trim()")
+    return str(text).startswith(name)
+
+
+def tab_to(tab: Any, name: str) -> None:
+    """Press the tab key until an element with this text has the focus."""
+    for _ in range(120):
+        tab.keyboard.press("Tab")
+        if has_focus(tab, name):
+            return
+    raise AssertionError(f"{name} cannot be reached with the tab key")
+
+
+def test_plan_is_made_with_the_keyboard_only(open_page: Callable[..., Any], folder: Path) -> None:
+    write_mini(folder / "mini")
+    tab = open_page()
+    tab_to(tab, "Open")
+    tab.keyboard.press("Enter")
+    tab.get_by_role("heading", level=1, name="Poles").wait_for()
+    wait_until(tab, partial(has_focus, tab, "Poles"))
+    for step in ("Traffic", "Run"):
+        tab_to(tab, f"Next: {step}")
+        tab.keyboard.press("Enter")
+        wait_until(tab, partial(has_focus, tab, step))
+    tab_to(tab, "Start the run")
+    tab.keyboard.press("Enter")
+    tab.get_by_role("heading", name="Ranking").wait_for(timeout=JOB_MS)
+    wait_until(tab, partial(has_focus, tab, "Run"))
+    tab_to(tab, "Next: Decide")
+    tab.keyboard.press("Enter")
+    tab_to(tab, "Find the best 2 poles")
+    tab.keyboard.press("Enter")
+    tab.get_by_role("heading", name="2 sensors").wait_for(timeout=JOB_MS)
+    tab_to(tab, "pole_")
+    tab.keyboard.press("Enter")
+    assert tab.locator(".item.sensor.selected").count() == 1

@@ -76,6 +76,13 @@ export function byId(id) {
   return element;
 }
 
+/** Move the focus to the heading of a part of the page, so that keyboard and screen reader go on there. @param {Element} element */
+export function focusHeading(element) {
+  const heading = element.querySelector("h1");
+  heading?.setAttribute("tabindex", "-1");
+  heading?.focus({ preventScroll: true });
+}
+
 /**
  * Rebuild a part of the page, and keep its scroll position, and the focus and what was typed in the field of the same
  * data-key.
@@ -86,14 +93,18 @@ export function keepingFocus(element, rebuild) {
   const active = document.activeElement;
   const inside = active instanceof HTMLElement && element.contains(active) ? active : null;
   const key = inside?.dataset.key ?? "";
-  const typed = inside instanceof HTMLInputElement && inside.value !== inside.defaultValue ? inside.value : null;
+  const isText = inside instanceof HTMLInputElement && inside.type === "text";
+  const typed = isText && inside.value !== inside.defaultValue ? inside.value : null;
+  const [start, end] = isText ? [inside.selectionStart, inside.selectionEnd] : [null, null];
   const top = element.scrollTop;
   rebuild();
   element.scrollTop = top;
   const again = key && element.querySelector(`[data-key="${CSS.escape(key)}"]`);
+  if (inside && !(again instanceof HTMLElement && !again.matches(":disabled"))) focusHeading(element);
   if (!(again instanceof HTMLElement)) return;
-  if (again instanceof HTMLInputElement && again.type === "text" && typed !== null) again.value = typed;
+  if (isText && again instanceof HTMLInputElement && typed !== null) again.value = typed;
   again.focus({ preventScroll: true });
+  if (isText && again instanceof HTMLInputElement) again.setSelectionRange(start, end);
 }
 
 /**

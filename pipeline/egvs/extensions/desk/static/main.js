@@ -1,6 +1,6 @@
 // Starts the page: connects it with the server, and draws what changed.
 import { listen } from "./api.js";
-import { byId, h, keepingFocus, show } from "./dom.js";
+import { byId, focusHeading, h, keepingFocus, show } from "./dom.js";
 import { change, data, fetchStart, fetchState, isBusy, onChange, say, settled, takeJob, update } from "./store.js";
 import { forgetRefused } from "./fields.js";
 import { drawJob } from "./progress.js";
@@ -29,15 +29,6 @@ function go(id) {
   visited.add(data.step);
   if (location.hash !== `#${id}`) location.hash = id;
   else readStep();
-}
-
-/** Move the focus to the heading of what was opened, so that keyboard and screen reader go on there. */
-function focusHeading() {
-  setTimeout(() => {
-    const heading = byId("panel").querySelector("h1");
-    heading?.setAttribute("tabindex", "-1");
-    heading?.focus();
-  });
 }
 
 function readStep() {
@@ -73,14 +64,14 @@ function drawNext() {
   return next && h("footer.next", {},
     h(`button${STEPS[at].isOptional || STEPS[at].isDone(data.project) ? ".main" : ""}`, { type: "button", "data-key": "next", onclick: () => {
       go(next.id);
-      focusHeading();
+      setTimeout(() => focusHeading(byId("panel")));
     } }, `Next: ${next.title} `, h("span", { "aria-hidden": "true" }, "→")));
 }
 
 /** Project or map that is shown. */
 let shownPage = "";
 
-/** Whether a job ran when the page was drawn: while it goes on, only its bar changes. */
+/** Whether a job ran when the page was drawn: until that changes, only its bar does. */
 let wasBusy = false;
 
 /** @param {Set<string>} changed */
@@ -92,7 +83,7 @@ function draw(changed) {
   drawJob();
   keepingFocus(byId("top"), drawHeader);
   if (data.revision < 0) return;
-  if (changed.size === 1 && changed.has("job") && isBusy() && wasBusy) return;
+  if (changed.size === 1 && changed.has("job") && isBusy() === wasBusy) return;
   wasBusy = isBusy();
   keepingFocus(panel, () => {
     if (!data.project) return drawStart(panel);
@@ -132,7 +123,7 @@ onChange(draw);
 onChange((changed) => {
   if (changed.has("project") && !data.project) fetchStart();
   const page = data.project?.id ?? data.upload?.id ?? "";
-  if (page !== shownPage && document.activeElement === document.body) focusHeading();
+  if (page !== shownPage && document.activeElement === document.body) setTimeout(() => focusHeading(byId("panel")));
   shownPage = page;
 });
 byId("undo").addEventListener("click", () => stepBack("undo"));

@@ -39,7 +39,7 @@ export function drawPoles(panel) {
         { title: "Pole", isHead: true, cell: (site) => h("button.link", {
           type: "button", "data-key": `pole.${site.site}`, "aria-pressed": String(site.site === data.selected), onclick: () => choosePole(site.site),
         }, site.site) },
-        { title: "Kind", cell: kindOf },
+        { title: "Kind", cell: (site) => h("span", {}, kindOf(site), site.moved_m > 0 && h("small", {}, `assumed, moved ${readable(site.moved_m, 1)} m`)) },
         { title: "Height, m", isNumber: true, cell: (site) => (site.z_m === null ? h("span.quiet", {}, listText(project.mounts.heights_m)) : fieldText(site.z_m)) },
         { title: "Use", cell: (site) => (site.must ? "must" : site.must_not ? "must not" : "") },
       ],
