@@ -15,7 +15,7 @@ from urllib.parse import quote, urlsplit
 
 from egvs.extensions.desk.serving import make_server
 
-JOB_S = 300.0
+JOB_S = 900.0
 
 
 class Client:
@@ -33,7 +33,7 @@ class Client:
         self, method: str, path: str, body: Any = None, headers: dict[str, str] | None = None, *, chunked: bool = False
     ) -> tuple[int, dict[str, str], bytes]:
         """Send a request; return status, headers and body."""
-        connection = http.client.HTTPConnection(self.host, timeout=60)
+        connection = http.client.HTTPConnection(self.host, timeout=600)
         sent = {"Origin": f"http://{self.host}", "Cookie": self.cookie, **(headers or {})}
         try:
             sent = {key: value for key, value in sent.items() if value}
