@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+import egvs
 from egvs.extensions.desk.server import STATIC
 from tests.accessibility import violations
 from tests.conftest import write_mini
@@ -86,6 +87,23 @@ def town(folder: Path, made_town: Path, open_page: Callable[..., Any]) -> Any:
     """A tab with the town open."""
     shutil.copytree(made_town, folder / "town")
     return open_scenario(open_page(), "town")
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the scenario ``mini`` and its run."""
+    made = tmp_path_factory.mktemp("finished")
+    egvs.run(egvs.load(write_mini(made / "mini")), made / "runs" / "mini")
+    return made
+
+
+@pytest.fixture
+def finished(folder: Path, finished_run: Path, open_page: Callable[..., Any]) -> Any:
+    """A tab with ``mini``, which has results."""
+    shutil.copytree(finished_run, folder, dirs_exist_ok=True)
+    tab = open_scenario(open_page(), "mini")
+    go(tab, "Decide")
+    return tab
 
 
 def open_scenario(tab: Any, name: str) -> Any:
@@ -197,6 +215,9 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
     assert "signal mast" in tab.get_by_role("region", name="Pole signal1").inner_text()
     type_into(tab, "Height", "4,5")
     wait_until(tab, lambda: site(tab, "signal1")["z_m"] == 4.5)
+    type_into(tab, "Heights, m", "4 6")
+    type_into(tab, "Tilts, °", "-5")
+    wait_until(tab, lambda: state(tab)["project"]["mounts"]["pitch_deg"] == [-5])
     tab.get_by_role("button", name="Add a pole").click()
     tab.mouse.click(*on_screen(tab, 211.5, 211.0))
     tab.get_by_role("region", name="Pole new1").wait_for()
@@ -337,6 +358,8 @@ def test_run_is_stopped_and_continued_in_two_tabs(folder: Path, made_town: Path,
     shutil.copytree(made_town, folder / "town")
     tab, other = open_scenario(open_page(), "town"), open_page()
     other.locator(".item.pole").first.wait_for()
+    go(tab, "Decide")
+    assert "Run first" in tab.locator("#panel").inner_text()
     go(tab, "Take along")
     assert tab.get_by_title("Save GeoPackage").is_disabled()
     go(tab, "Run")
@@ -346,15 +369,8 @@ def test_run_is_stopped_and_continued_in_two_tabs(folder: Path, made_town: Path,
     assert tab.get_by_role("button", name=re.compile("Start the run|Continue the run")).is_enabled()
 
 
-def test_plan_that_cannot_be_is_explained(open_page: Callable[..., Any], folder: Path) -> None:
-    write_mini(folder / "mini")
-    tab = open_scenario(open_page(), "mini")
-    go(tab, "Decide")
-    assert "Run first" in tab.locator("#panel").inner_text()
-    go(tab, "Run")
-    tab.get_by_role("button", name="Start the run").click()
-    tab.get_by_role("heading", name="Ranking").wait_for(timeout=JOB_MS)
-    go(tab, "Decide")
+def test_plan_that_cannot_be_is_explained(finished: Any) -> None:
+    tab = finished
     tab.get_by_role("radio", name="budget").check()
     assert tab.get_by_role("button", name="Find the best plan").is_disabled()
     type_into(tab, "Budget", "ten")
@@ -382,13 +398,8 @@ def test_signal_times_are_typed_and_checked(town: Any) -> None:
     wait_until(town, lambda: [phase["green_s"] for phase in state(town)["project"]["signals"][0]["phases"]] == times)
 
 
-def test_lorry_is_dropped_on_the_map(open_page: Callable[..., Any], folder: Path) -> None:
-    write_mini(folder / "mini")
-    tab = open_scenario(open_page(), "mini")
-    go(tab, "Run")
-    tab.get_by_role("button", name="Start the run").click()
-    tab.get_by_role("heading", name="Ranking").wait_for(timeout=JOB_MS)
-    go(tab, "Decide")
+def test_lorry_is_dropped_on_the_map(finished: Any) -> None:
+    tab = finished
     tab.get_by_role("button", name="Parked lorry").click()
     x, y = middle(tab.locator(".outlines .obstacle"))
     before = state(tab)["project"]["obstacles"][0]
