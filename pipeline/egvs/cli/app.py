@@ -412,9 +412,14 @@ def _unmeasured_effects(statuses: Sequence[EffectStatus], costs: Collection[str]
 
 @app.command()
 def explore(
+    context: typer.Context,
     folder: Annotated[
-        Path, typer.Argument(metavar="RUN|SCENARIO", help="Folder of a run, or a scenario, which is run first.")
-    ],
+        Path | None,
+        typer.Argument(
+            metavar="RUN|SCENARIO",
+            help="Folder of a run, or a scenario, which is run first; without it, the page of egvs desk is opened.",
+        ),
+    ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 for any.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
     out: Out = None,
@@ -434,6 +439,11 @@ def explore(
     from egvs.cli.console import ProgressDisplay
     from egvs.core import files, plugins
 
+    if folder is None:
+        if to is not None or out is not None or set_ or jobs or view:
+            raise InputError("RUN|SCENARIO", "no folder is given", "Name a run or a scenario.")
+        _open_start_page(context, port, browser=browser)
+        return
     plugins.require_libraries("egvs explore", "explore", "viser", "PIL")
     from egvs.cli import answer, sources
     from egvs.explore.page import Page, check_port_free
@@ -463,6 +473,15 @@ def explore(
             print()
         finally:
             page.stop()
+
+
+def _open_start_page(context: typer.Context, port: int, *, browser: bool) -> None:
+    """Call ``egvs desk``, a command of an extension."""
+    group = context.find_root()
+    command = group.command.get_command(group, "desk")  # type: ignore[attr-defined]
+    if command is None:
+        raise InputError("RUN|SCENARIO", "no folder is given", "Name a run or a scenario.")
+    command.callback(folder=Path(), port=port, browser=browser)
 
 
 def _write_page_file(

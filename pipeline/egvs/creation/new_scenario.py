@@ -501,7 +501,32 @@ def list_junctions(
     progress: ProgressCallback = no_progress,
     at: tuple[float, float] | None = None,
 ) -> list[ListedJunction]:
-    """Return the junctions of a road map of which a scenario can be made, the largest first; nothing is written.
+    """Return the junctions of a road map of which a scenario can be made; nothing is written.
+
+    The largest come first; with ``at``, the nearest, at most :data:`MOST_LISTED_NEARBY`. Parameters and errors are
+    those of :func:`read_map_streets`.
+    """
+    streets = read_map_streets(maps, options, progress, at)
+    progress("lists the junctions", 0, 0)
+    listed = [
+        ListedJunction(
+            junction.title, junction.arms, junction.lanes_in, junction.signalised,
+            _at_option(streets, junction.at_m), _distance_m(streets, junction, at),
+        )
+        for junction in junctions.distinct_crossings(streets)
+    ]  # fmt: skip
+    if at is None:
+        return listed
+    return sorted(listed, key=lambda junction: junction.distance_m or 0.0)[:MOST_LISTED_NEARBY]
+
+
+def read_map_streets(
+    maps: Sequence[str | Path],
+    options: NewScenarioOptions | None = None,
+    progress: ProgressCallback = no_progress,
+    at: tuple[float, float] | None = None,
+) -> Streets:
+    """Return the streets of a road map; nothing is written.
 
     Parameters
     ----------
@@ -512,7 +537,7 @@ def list_junctions(
     progress
         Called at the beginning of each step.
     at
-        As for :func:`create_scenario`: the nearest junctions come first, at most :data:`MOST_LISTED_NEARBY`.
+        As for :func:`create_scenario`: of an OpenStreetMap extract, only streets near it are read.
 
     Raises
     ------
@@ -527,18 +552,7 @@ def list_junctions(
         road_options = RoadOptions(
             options.lefthand, options.walk, bool(files.terrain), at, options.righthand, _LISTED_REACH_M
         )  # fmt: skip
-        streets = _read_roads(files.roads, road_options).streets
-        progress("lists the junctions", 0, 0)
-        listed = [
-            ListedJunction(
-                junction.title, junction.arms, junction.lanes_in, junction.signalised,
-                _at_option(streets, junction.at_m), _distance_m(streets, junction, at),
-            )
-            for junction in junctions.distinct_crossings(streets)
-        ]  # fmt: skip
-        if at is None:
-            return listed
-        return sorted(listed, key=lambda junction: junction.distance_m or 0.0)[:MOST_LISTED_NEARBY]
+        return _read_roads(files.roads, road_options).streets
 
 
 def _open_files(
