@@ -219,7 +219,7 @@ class Streets:
 
     def node_positions(self, nodes: Mapping[int, tuple[float, float]]) -> dict[int, XY]:
         """World-frame x, y in metres of nodes of a map, given as latitude and longitude in degrees by identifier."""
-        lats_deg, lons_deg = zip(*nodes.values(), strict=True)
+        lats_deg, lons_deg = zip(*nodes.values(), strict=True) if nodes else ((), ())
         return dict(zip(nodes, self.to_xy(lons_deg, lats_deg), strict=True))
 
     def near(self, window: BaseGeometry) -> Streets:

@@ -27,6 +27,7 @@ from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan
 from egvs.formats import xml
 from egvs.formats.reader_process import Block, read_blocks, serve
+
 Tags = dict[str, str]
 
 _KINDS = frozenset({"node", "way", "relation"})
@@ -93,6 +94,11 @@ class Bounds:
         """Return whether a position is inside or on the boundary."""
         return self.south_deg <= lat_deg <= self.north_deg and self.west_deg <= lon_deg <= self.east_deg
 
+    def meets(self, other: Bounds) -> bool:
+        """Return whether two rectangles have a common point."""
+        meets_lats = self.south_deg <= other.north_deg and other.south_deg <= self.north_deg
+        return meets_lats and self.west_deg <= other.east_deg and other.west_deg <= self.east_deg
+
 
 @dataclass(frozen=True)
 class OsmExtract:
@@ -123,6 +129,19 @@ class OsmExtract:
     bounds: Bounds
     declared: bool
     path: Path = field(default=Path("extract"), compare=False)
+
+    def way_bounds(self, way: Way) -> Bounds | None:
+        """Return the bounding box of a way; None if the extract has none of its nodes."""
+        positions = [self.nodes[node] for node in way.nodes if node in self.nodes]
+        if not positions:
+            return None
+        lats_deg, lons_deg = zip(*positions, strict=True)
+        return Bounds(min(lats_deg), min(lons_deg), max(lats_deg), max(lons_deg))
+
+    def is_near(self, way: Way, area: Bounds) -> bool:
+        """Return whether the bounding box of a way meets an area; a way without positions may be anywhere."""
+        bounds = self.way_bounds(way)
+        return bounds is None or bounds.meets(area)
 
 
 def read_osm(path: Path) -> OsmExtract:

@@ -1,7 +1,7 @@
 """Read a user's XML safely and in pieces, in any common encoding.
 
 Steps: decompress gzip, recognised by the first two bytes; convert encodings that XML parsers do not know to UTF-8;
-parse with defusedxml, which rejects entities and document types; yield one child of the root at a time and forget it.
+parse with expat, reject document types, and thereby entities; yield one child of the root at a time and forget it.
 The decompressed size, and the size and depth of a child, are limited. Whatever is wrong with the file becomes an
 :class:`InputError` that names it.
 
@@ -17,11 +17,11 @@ import gzip
 import io
 import re
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import IO, Any, cast
-from xml.etree.ElementTree import Element, ParseError, TreeBuilder
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 from xml.parsers import expat
 
 from egvs.core import limits
@@ -143,47 +143,87 @@ def iter_elements(
         When the root has another tag, the XML is malformed or declares entities or a document type, a child is too
         large or too deep, its gzip is damaged, or its encoding is unknown.
     """
-    where = name or path
-    max_events = 2 * limits.XML_ELEMENTS.maximum  # each has a start and an end
-    with _parse(path, name) as (events, meter):
-        _, top = next(events)
-        _check_root(where, root, top.tag)
-        if on_root is not None:
-            on_root(top)
-        depth = 0
-        for number, (event, element) in enumerate(events):
-            depth += 1 if event == "start" else -1
-            if number > max_events:
-                limits.XML_ELEMENTS.check(where, number, f"has more than {max_events // 2:,} elements")
-            if depth > MAX_DEPTH:
-                raise InputError(where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
-            if event == "end" and depth == 0:
-                meter.bytes_since_child = 0
-                yield element
-                top.clear()
+    children = _Children(name or path, root)
+    for _ in _parse(path, name, children):
+        if on_root is not None and children.root is not None:
+            on_root(children.root)
+            on_root = None
+        yield from children.pop()
 
 
 def read_root_tag(path: Path) -> str:
     """Return the tag of the root, with its namespace as in ``{http://...}kml``; errors are those of iter_elements."""
-    with _parse(path, None) as (events, _):
-        return str(next(events)[1].tag)
+    children = _Children(path, "")
+    with closing(_parse(path, None, children)) as chunks:
+        next(_ for _ in chunks if children.root is not None)
+    assert children.root is not None, "a file without root is not well-formed"
+    return str(children.root.tag)
 
 
-@contextmanager
-def _parse(path: Path, name: Path | None) -> Iterator[tuple[Iterator[tuple[str, Any]], _ElementMeter]]:
-    """Yield the starts and ends of elements, and what counts the bytes of each child of the root."""
-    from defusedxml.ElementTree import DefusedXMLParser, iterparse
-
+def _parse(path: Path, name: Path | None, children: _Children) -> Generator[None, None, None]:
+    """Parse a file; yields after each piece of it."""
     with _open_for_parser(path, name) as (meter, encoding):
-        parser = DefusedXMLParser(target=TreeBuilder(), encoding=encoding, forbid_dtd=True)
-        yield iterparse(meter, ("start", "end"), parser), meter
+        parser = XMLParser(target=children, encoding=encoding)
+        while chunk := meter.read(_CHUNK_BYTES):
+            parser.feed(chunk)
+            if children.complete:
+                meter.bytes_since_child = 0
+            yield
+        parser.close()
+        yield
+
+
+class _Children:
+    """Collects the children of the root element; the target of a parser.
+
+    Parameters
+    ----------
+    where
+        The file, for messages.
+    root
+        Expected tag of the root; any if empty.
+    """
+
+    def __init__(self, where: object, root: str) -> None:
+        self._where, self._expected_root = where, root
+        self._builder = TreeBuilder()
+        self._depth, self._count, self._most = 0, 0, limits.XML_ELEMENTS.maximum
+        self.root: Element | None = None
+        self.complete: list[Element] = []
+        self.data, self.close = self._builder.data, self._builder.close
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._count += 1
+        self._depth += 1
+        if self._count > self._most:
+            limits.XML_ELEMENTS.check(self._where, self._count, f"has more than {self._most:,} elements")
+        if self._depth > MAX_DEPTH:
+            raise InputError(self._where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
+        element = self._builder.start(tag, attributes)
+        if self.root is None:
+            _check_root(self._where, self._expected_root, tag)
+            self.root = element
+
+    def end(self, tag: str) -> None:
+        self._depth -= 1
+        element = self._builder.end(tag)
+        if self._depth == 1:
+            self.complete.append(element)
+
+    def doctype(self, *_: object) -> None:
+        raise _doctype_error(self._where)
+
+    def pop(self) -> list[Element]:
+        """Return the children that are complete, and forget them."""
+        complete, self.complete = self.complete, []
+        if complete and self.root is not None:
+            self.root.clear()
+        return complete
 
 
 @contextmanager
 def _open_for_parser(path: Path, name: Path | None) -> Iterator[tuple[_ElementMeter, str | None]]:
     """Yield the file in an encoding that a parser reads, and that encoding if it is not the declared one."""
-    from defusedxml.common import DefusedXmlException
-
     where = name or path
     encoding = file_encoding(path, where)
     with open_bounded(path, name) as file, translate_errors(where):
@@ -193,13 +233,9 @@ def _open_for_parser(path: Path, name: Path | None) -> Iterator[tuple[_ElementMe
             yield meter, "utf-8" if is_decoded else None
         except (ParseError, expat.ExpatError) as error:
             raise InputError(where, f"is not well-formed XML: {error}", COMPLETE_FILE) from None
-        except DefusedXmlException:
-            raise _doctype_error(where) from None
 
 
-def scan_tags(
-    path: Path, root: str, on_tag: Callable[[str, dict[str, str]], None], name: Path | None = None
-) -> None:
+def scan_tags(path: Path, root: str, on_tag: Callable[[str, dict[str, str]], None], name: Path | None = None) -> None:
     """Call a function with the name and the attributes of each element, the root's first; texts are left out.
 
     Much faster than :func:`iter_elements`. Parameters and errors are the same, but elements may be nested.

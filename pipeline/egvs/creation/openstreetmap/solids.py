@@ -20,9 +20,12 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
@@ -31,6 +34,7 @@ from egvs.core.polygons import PairCount, check_corners, check_crossings, repair
 from egvs.creation.carriageway import clear_of_carriageway, geometry_pieces, lanes_under, large_pieces
 from egvs.creation.junctions import Streets
 from egvs.creation.map_parts import DECK_BASE_M, DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedPole, MappedSolid
+from egvs.creation.openstreetmap import node_positions, ways_near
 from egvs.creation.openstreetmap.street_network import PATH_HIGHWAYS
 from egvs.formats.osm import OsmExtract, Relation, Tags, Way, parse_number
 from egvs.world import map_features
@@ -50,6 +54,8 @@ _DECK_LANE_M, _DECK_EDGE_M, _TRACK_M, _PATH_M = 3.5, 1.0, 5.0, 3.0
 
 _SOLID_TYPES = SolidTypes()
 _BUILDING_KEYS = ("building:part", "building", "man_made")
+_SOLID_KEYS = frozenset({*_BUILDING_KEYS, "barrier", "natural"})
+"""Keys of ways that may be static objects."""
 
 CARRYING_POLES = {
     "highway.street_lamp": "lamp", "highway.traffic_signals": "signal", "man_made.utility_pole": "pole",
@@ -83,8 +89,14 @@ def map_solids(
     counts : ImportCounts
         What happened to the mapped objects.
     """
-    xy = streets.node_positions(extract.nodes)
     counts = ImportCounts()
+    if window is not None:
+        extract = _within_reach(extract, streets, window, counts)
+    xy = node_positions(
+        extract,
+        streets,
+        {*extract.node_tags, *(node for way in (*extract.ways.values(), *bridges) for node in way.nodes)},
+    )
     pairs = PairCount(extract.path)
     lanes = shapely.STRtree(list(streets.areas.values()))
 
@@ -108,6 +120,38 @@ def map_solids(
         counts.keep(crown)
         solids += [trunk, _above_traffic(crown, lanes, counts)]
     return solids, counts
+
+
+def _within_reach(extract: OsmExtract, streets: Streets, window: BaseGeometry, counts: ImportCounts) -> OsmExtract:
+    """Return the extract without far buildings, which are only counted, and without far ways that are not solid."""
+    kept = ways_near(extract, streets, window)
+    buildings = [relation for relation in extract.relations if _multipolygon_tags(relation, extract) is not None]
+    of_relations = {way_id for relation in buildings for way_id in relation.ways("outer", "", "inner")}
+    far, parts = [], []
+    for way in extract.ways.values():
+        if way.id in of_relations or "building:part" in way.tags:
+            parts.append(way)
+        elif way.id not in kept and _is_outline(way.tags) and way.closed and _has_positions(way, extract.nodes):
+            far.append(way)
+        elif not _SOLID_KEYS.isdisjoint(way.tags):
+            kept[way.id] = way
+    # parts may cover an outline, which then is no object
+    with_parts = {*shapely.STRtree(_boxes(parts, extract)).query(_boxes(far, extract))[0].tolist()}
+    for number, way in enumerate(far):
+        if number in with_parts or map_features.is_underground(way.tags):
+            parts.append(way)
+            continue
+        solid = _building_type(way.tags)
+        extent_from_tags(way.tags, solid, counts)
+        counts.drop(_building_kind(solid), OUT_OF_RANGE)
+    kept |= {way.id: way for way in parts}
+    return dataclasses.replace(extract, ways=dict(sorted(kept.items())))
+
+
+def _boxes(ways: Sequence[Way], extract: OsmExtract) -> NDArray[Any]:
+    """Return the bounding boxes of ways, longitude and latitude in degrees; None for a way without positions."""
+    bounds = [extract.way_bounds(way) for way in ways]
+    return np.array([box and shapely.box(box.west_deg, box.south_deg, box.east_deg, box.north_deg) for box in bounds])
 
 
 def _is_outside(solid: MappedSolid, window: BaseGeometry | None) -> bool:
@@ -215,11 +259,15 @@ def find_buildings(
 def _make_building(name: str, tags: Tags, pieces: list[BaseGeometry], counts: ImportCounts) -> MappedSolid:
     solid = _building_type(tags)
     extent = extent_from_tags(tags, solid, counts)
-    kind = "roof" if solid.thickness_m else "building"
     source = extent.source
     if source == "default" and solid.height_m:
         source = "type"
+    kind = _building_kind(solid)
     return MappedSolid(name, kind, shapely.MultiPolygon(pieces), extent.top_m, source, extent.base_m)
+
+
+def _building_kind(solid: SolidType) -> str:
+    return "roof" if solid.thickness_m else "building"
 
 
 def _solid_type(tags: Tags, key: str) -> SolidType | None:
@@ -286,7 +334,7 @@ def _footprints(
             yield f"way/{way.id}", way.tags, way_area(way, xy, counts, pairs)
 
 
-def _has_positions(way: Way, xy: dict[int, XY]) -> bool:
+def _has_positions(way: Way, xy: Mapping[int, XY]) -> bool:
     return all(node in xy for node in way.nodes)
 
 
@@ -416,13 +464,19 @@ def find_poles(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) -> 
 
 def carrying_poles(extract: OsmExtract, streets: Streets, window: BaseGeometry | None) -> tuple[MappedPole, ...]:
     """Return the poles of :data:`CARRYING_POLES` in a window (world frame); parameters as of :func:`map_solids`."""
-    xy = streets.node_positions(extract.nodes)
-    poles = []
+    kinds = {}
     for node, tags in extract.node_tags.items():
-        kinds = [CARRYING_POLES[f"{key}.{value}"] for key, value in tags.items() if f"{key}.{value}" in CARRYING_POLES]
-        if kinds and (window is None or window.covers(point_at(xy[node]))):
-            poles.append(MappedPole(f"node/{node}", kinds[0], xy[node]))
-    return tuple(poles)
+        of_node = [
+            CARRYING_POLES[f"{key}.{value}"] for key, value in tags.items() if f"{key}.{value}" in CARRYING_POLES
+        ]
+        if of_node:
+            kinds[node] = of_node[0]
+    xy = node_positions(extract, streets, kinds)
+    return tuple(
+        MappedPole(f"node/{node}", kind, xy[node])
+        for node, kind in kinds.items()
+        if window is None or window.covers(point_at(xy[node]))
+    )
 
 
 def _pole_type(tags: Tags) -> SolidType | None:
