@@ -29,7 +29,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY
 from egvs.creation.junctions import StreetJunction, Streets
-from egvs.creation.openstreetmap import node_positions, ways_near
+from egvs.creation.openstreetmap import bounds_around, node_positions
 from egvs.creation.openstreetmap.street_network import is_road
 from egvs.formats.osm import OsmExtract, Tags, Way, parse_number
 
@@ -128,10 +128,11 @@ def find_other_levels(
     OtherLevels
         Empty where all ways are on the junction's level, or lead to it.
     """
+    area = bounds_around(streets, region)
     ways = [
         way
-        for way in ways_near(extract, streets, region).values()
-        if (is_road(way) or _is_bridge(way.tags)) and way.tags.get("area") != "yes"
+        for way in extract.ways.values()
+        if (is_road(way) or _is_bridge(way.tags)) and way.tags.get("area") != "yes" and extract.is_near(way, area)
     ]
     xy = node_positions(extract, streets, {node for way in ways for node in way.nodes})
     pieces = {way.id: _WayInRegion(way, xy, region) for way in ways}

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection
 from typing import TYPE_CHECKING
 
-from egvs.formats.osm import Bounds, OsmExtract, Way
+from egvs.formats.osm import Bounds, OsmExtract
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
@@ -30,13 +30,12 @@ def distance_m(one: tuple[float, float], other: tuple[float, float]) -> float:
     return EARTH_M * math.hypot(north, east)
 
 
-def ways_near(extract: OsmExtract, streets: Streets, window: BaseGeometry) -> dict[int, Way]:
-    """Return the ways whose bounding boxes meet a window (world frame, metres), or come near it, by identifier."""
+def bounds_around(streets: Streets, window: BaseGeometry) -> Bounds:
+    """Return a rectangle in degrees around a window (world frame, metres), some metres larger."""
     west_m, south_m, east_m, north_m = window.buffer(_MARGIN_M).bounds
     corners = streets.to_degrees([(x, y) for x in (west_m, east_m) for y in (south_m, north_m)])
     lons_deg, lats_deg = zip(*corners, strict=True)
-    area = Bounds(min(lats_deg), min(lons_deg), max(lats_deg), max(lons_deg))
-    return {number: way for number, way in extract.ways.items() if extract.is_near(way, area)}
+    return Bounds(min(lats_deg), min(lons_deg), max(lats_deg), max(lons_deg))
 
 
 def node_positions(extract: OsmExtract, streets: Streets, nodes: Collection[int]) -> dict[int, XY]:

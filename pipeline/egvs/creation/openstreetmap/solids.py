@@ -20,7 +20,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -34,9 +35,9 @@ from egvs.core.polygons import PairCount, check_corners, check_crossings, repair
 from egvs.creation.carriageway import clear_of_carriageway, geometry_pieces, lanes_under, large_pieces
 from egvs.creation.junctions import Streets
 from egvs.creation.map_parts import DECK_BASE_M, DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedPole, MappedSolid
-from egvs.creation.openstreetmap import node_positions, ways_near
+from egvs.creation.openstreetmap import bounds_around, node_positions
 from egvs.creation.openstreetmap.street_network import PATH_HIGHWAYS
-from egvs.formats.osm import OsmExtract, Relation, Tags, Way, parse_number
+from egvs.formats.osm import Bounds, OsmExtract, Relation, Tags, Way, parse_number
 from egvs.world import map_features
 from egvs.world.clearances import CLEARANCE_M
 from egvs.world.map_features import SolidType, SolidTypes, VerticalExtent
@@ -52,7 +53,7 @@ _DECK_LANE_M, _DECK_EDGE_M, _TRACK_M, _PATH_M = 3.5, 1.0, 5.0, 3.0
 """Widths of bridges without a width in the map: of each lane, of each edge, of a railway track, and of a path."""
 
 
-_SOLID_TYPES = SolidTypes()
+_area_type = lru_cache(1000)(SolidTypes().area_type)
 _BUILDING_KEYS = ("building:part", "building", "man_made")
 _SOLID_KEYS = frozenset({*_BUILDING_KEYS, "barrier", "natural"})
 """Keys of ways that may be static objects."""
@@ -123,35 +124,42 @@ def map_solids(
 
 
 def _within_reach(extract: OsmExtract, streets: Streets, window: BaseGeometry, counts: ImportCounts) -> OsmExtract:
-    """Return the extract without far buildings, which are only counted, and without far ways that are not solid."""
-    kept = ways_near(extract, streets, window)
-    buildings = [relation for relation in extract.relations if _multipolygon_tags(relation, extract) is not None]
-    of_relations = {way_id for relation in buildings for way_id in relation.ways("outer", "", "inner")}
-    far, parts = [], []
+    """Return the extract with only those ways that may be solid, without far buildings: these are only counted."""
+    area = bounds_around(streets, window)
+    relations = [relation for relation in extract.relations if _multipolygon_tags(relation, extract) is not None]
+    of_relations = {way_id for relation in relations for way_id in relation.ways("outer", "", "inner")}
+    kept: dict[int, Way] = {}
+    far: dict[int, Bounds] = {}
+    parts: list[Bounds] = []
     for way in extract.ways.values():
-        if way.id in of_relations or "building:part" in way.tags:
-            parts.append(way)
-        elif way.id not in kept and _is_outline(way.tags) and way.closed and _has_positions(way, extract.nodes):
-            far.append(way)
-        elif not _SOLID_KEYS.isdisjoint(way.tags):
-            kept[way.id] = way
-    # parts may cover an outline, which then is no object
-    with_parts = {*shapely.STRtree(_boxes(parts, extract)).query(_boxes(far, extract))[0].tolist()}
-    for number, way in enumerate(far):
-        if number in with_parts or map_features.is_underground(way.tags):
-            parts.append(way)
+        if way.id not in of_relations and _SOLID_KEYS.isdisjoint(way.tags):
             continue
-        solid = _building_type(way.tags)
-        extent_from_tags(way.tags, solid, counts)
-        counts.drop(_building_kind(solid), OUT_OF_RANGE)
-    kept |= {way.id: way for way in parts}
-    return dataclasses.replace(extract, ways=dict(sorted(kept.items())))
+        kept[way.id] = way
+        bounds = extract.way_bounds(way)
+        if bounds is not None and (way.id in of_relations or "building:part" in way.tags):
+            parts.append(bounds)
+        elif bounds is not None and not bounds.meets(area) and _is_complete_outline(way, extract.nodes):
+            far[way.id] = bounds
+    # parts may cover an outline, which then is no object
+    with_parts = {*shapely.STRtree(_boxes(parts)).query(_boxes(far.values()))[0].tolist()}
+    for number, way_id in enumerate(far):
+        if number not in with_parts:
+            tags = kept.pop(way_id).tags
+            solid = _building_type(tags)
+            extent_from_tags(tags, solid, counts)
+            counts.drop(_building_kind(solid), OUT_OF_RANGE)
+    return dataclasses.replace(extract, ways=kept)
 
 
-def _boxes(ways: Sequence[Way], extract: OsmExtract) -> NDArray[Any]:
-    """Return the bounding boxes of ways, longitude and latitude in degrees; None for a way without positions."""
-    bounds = [extract.way_bounds(way) for way in ways]
-    return np.array([box and shapely.box(box.west_deg, box.south_deg, box.east_deg, box.north_deg) for box in bounds])
+def _boxes(bounds: Iterable[Bounds]) -> NDArray[Any]:
+    corners_deg = [(box.west_deg, box.south_deg, box.east_deg, box.north_deg) for box in bounds]
+    boxes: NDArray[Any] = shapely.box(*np.array(corners_deg).reshape(-1, 4).T)
+    return boxes
+
+
+def _is_complete_outline(way: Way, nodes: Mapping[int, XY]) -> bool:
+    is_outline = way.closed and _is_outline(way.tags) and not map_features.is_underground(way.tags)
+    return is_outline and _has_positions(way, nodes)
 
 
 def _is_outside(solid: MappedSolid, window: BaseGeometry | None) -> bool:
@@ -275,7 +283,7 @@ def _solid_type(tags: Tags, key: str) -> SolidType | None:
     value = tags.get(key, "no")
     if value == "no":
         return None
-    return _SOLID_TYPES.area_type(f"{key.removesuffix(':part')}.{value}")
+    return _area_type(f"{key.removesuffix(':part')}.{value}")
 
 
 def _is_outline(tags: Tags) -> bool:
@@ -385,7 +393,7 @@ def find_barriers(
         value = way.tags.get("barrier", "no")
         if value == "no":
             continue
-        solid = _SOLID_TYPES.area_type(f"barrier.{value}")
+        solid = _area_type(f"barrier.{value}")
         if solid is None:
             counts.not_modelled[f"barrier={value}"] += 1
             continue
