@@ -294,6 +294,16 @@ def test_printed_solids_are_those_of_the_check(made: Made, capsys: pytest.Captur
     assert n_solids == check.check_scenario(loading.load(made[0])).solids > n_objects
 
 
+def test_prints_the_tables_to_edit_and_the_next_commands(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
+    new_summary.print_new_scenario(made[1])
+    edit, run, place = capsys.readouterr().out.splitlines()[-3:]
+    tables = re.findall(r"(\w+\.csv) \(", edit)
+    assert tables == ["counts.csv", "signals.csv", "sites.csv"]
+    assert all((made[0] / name).is_file() for name in tables)
+    assert run == f"next: egvs run {made[0]}"
+    assert place.strip().startswith(f"egvs place {made[0]} --count 2")
+
+
 def test_names_junction_and_attributes_source(made: Made) -> None:
     folder, summary = made
     assert summary.junction.title == "signalised junction of East Street and North Street"

@@ -144,6 +144,15 @@ def test_a_level_with_a_large_error_is_a_range() -> None:
     assert re.fullmatch(r"50 ± \d+ %", BOTH.text(0.5, None))
 
 
+def test_the_error_of_none_and_of_all_has_one_side() -> None:
+    found = math.ceil(100.0 * BOTH.error(None))
+    assert 5 < found < 10
+    assert BOTH.text(0.994, None) == f"99 ± {found} %"
+    assert BOTH.text(0.995, None) == "90 to 100 %"
+    assert BOTH.text(0.004, None) == "0 to 10 %"
+    assert NoticedShare(1.0, None, 1.0, 1.0).text == "90 to 100 %"
+
+
 def test_no_number_is_printed_for_a_level_that_was_not_measured() -> None:
     """A model that was compared with no street; corrected models without losses. The order of sites stays."""
     ranked = with_noticed(("a", 0.841, 0.897), ("b", 0.8, 0.89))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
 from egvs.formats import ply
+from egvs.stages import height_checks
+from egvs.traffic.network import Shape
 from tests.stages.conftest import LANES, net_xml
 from tests.stages.test_check import SCENARIOS, box, found, sites, statics
 
@@ -317,3 +321,12 @@ def test_houses_along_a_slope_are_valid(street: Path) -> None:
     sites(street, "pole_a,10,12,11", "pole_b,30.5,-12,14")
     statics(street, house(0.0), box((-30, 9), (-20, 14), height_m=5), box((60, 9), (70, 14), height_m=5))
     assert heights(street) == []
+
+
+def test_points_of_lanes_are_a_few_metres_apart_and_never_too_many() -> None:
+    """20 lanes of 900 km would be 3.6 million points."""
+    near: Any = SimpleNamespace(lanes=[Shape("0,0,1 12,0,4", "lane a"), Shape("3,3 3,7", "lane b")])
+    points_m = height_checks.lane_points_m(near)
+    assert points_m.tolist() == [[0, 0, 1], [4, 0, 2], [8, 0, 3], [12, 0, 4], [3, 3, 0], [3, 7, 0]]
+    many: Any = SimpleNamespace(lanes=[Shape("0,0 900000,0", f"lane {number}") for number in range(20)])
+    assert 1_900_000 < len(height_checks.lane_points_m(many)) <= 2_000_100

@@ -67,6 +67,13 @@ def test_rejects_invalid_shape_when_it_is_used(tmp_path):
         _ = network.read_net_xml(path).edges[1].lanes[0].shape_m
 
 
+def test_rejects_shapes_longer_than_any_street() -> None:
+    """A wrong digit in an exponent; what samples lanes would need gigabytes."""
+    assert network.Shape("0,0 999999,0", "lane x").shape_m.shape == (2, 3)
+    with pytest.raises(InputError, match=r"lane x: expected a shape of at most 1,000,000 m, got 94,400,016 m"):
+        _ = network.Shape("0,0 4,0 9.44e7,0 9.44e7,16", "lane x").shape_m
+
+
 @pytest.mark.parametrize("far", ["2147483648", "-1e300", "nan", "inf"])
 def test_rejects_coordinates_beyond_the_earth(tmp_path: Path, far: str) -> None:
     """Of a road; of a lane that is not a road's, when somebody asks for it."""
@@ -94,9 +101,9 @@ def test_speed_limit_of_zero_closes_a_lane(tmp_path: Path) -> None:
 
 
 def test_rejects_ground_with_too_many_points(tmp_path: Path) -> None:
-    """A road of 90,000 km on a hill."""
-    text = '<net><edge id="e" from="a" to="b"><lane id="e_0" shape="0,0,1 9e7,9,200"/></edge></net>'
-    (tmp_path / "n.net.xml").write_text(text)
+    """Roads of 90,000 km on a hill."""
+    edge = '<edge id="e{0}" from="a" to="b"><lane id="e{0}_0" shape="0,{0},1 9e5,9,200"/></edge>'
+    (tmp_path / "n.net.xml").write_text(f"<net>{''.join(map(edge.format, range(100)))}</net>")
     message = (
         r"n.net.xml: is so large that its ground needs [0-9,]+ points\. The limit is 2,000,000 points; set "
         r"EGVS_MAX_GROUND"

@@ -391,6 +391,7 @@ def test_drops_duplicate_solids(tmp_path: Path) -> None:
         ("0,0 a,0 4,4", "poly x: expected shape='x,y x,y ...' in metres"),
         ("0,0 4 4,4", "poly x: expected shape='x,y x,y ...' in metres"),
         ("0,0 nan,0 4,4 0,4", "poly x: geometry: expected finite coordinates"),
+        ("0,0 4,0 4,-1e308 0,4 0,0", "poly x: geometry: expected coordinates within 1e\\+08 m, got 1e\\+308 m"),
     ],
 )
 def test_rejects_invalid_shapes(tmp_path: Path, shape: str, message: str) -> None:

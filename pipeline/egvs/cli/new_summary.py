@@ -16,7 +16,7 @@ from egvs.core.wording import list_first, number_of
 from egvs.creation import junctions
 from egvs.creation.map_parts import OUT_OF_RANGE, ImportCounts
 from egvs.creation.new_scenario import ListedJunction, NewScenario
-from egvs.creation.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
+from egvs.creation.scenario_files import COUNTS_FILE, PITCHES_DEG, SENSOR, SIGNALS_FILE, SITES_FILE, STATICS_FILE
 from egvs.scenario.model import SCENARIO_FILE
 
 if TYPE_CHECKING:
@@ -38,7 +38,9 @@ def print_new_scenario(scenario: NewScenario, map_notes: Sequence[str] = ()) -> 
         out.print(f"warning: {warning}")
     if scenario.attributions:
         out.print(f"Map data {'; '.join(scenario.attributions)}")
+    out.print(f"edit: {_tables_to_edit(scenario)}; {SCENARIO_FILE} (existing_poles = 'all': the poles stand already)")
     out.print(f"next: {shlex.join(['egvs', 'run', str(scenario.folder)])}")
+    out.print(f"      {shlex.join(['egvs', 'place', str(scenario.folder), '--count', '2'])}   (or --budget)")
 
 
 def print_junctions(listed: Sequence[ListedJunction]) -> None:
@@ -85,6 +87,12 @@ def _describe_map(summary: MapSummary) -> str:
     if summary.height_range_m is not None:
         texts.append("tops at z = {:.1f} to {:.1f} m".format(*summary.height_range_m))
     return ", ".join(texts)
+
+
+def _tables_to_edit(scenario: NewScenario) -> str:
+    """Return the tables of the scenario that a user is expected to edit, with their contents."""
+    contents = {COUNTS_FILE: "counted vehicles", SIGNALS_FILE: "signal plan", SITES_FILE: "poles"}
+    return ", ".join(f"{name} ({what})" for name, what in contents.items() if (scenario.folder / name).is_file())
 
 
 def _position(scenario: NewScenario) -> str:

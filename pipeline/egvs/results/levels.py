@@ -60,6 +60,11 @@ def format_range(low: float, high: float) -> str:
     return f"{100.0 * low:.0f} to {format_percent(high, 0)}"
 
 
+def is_none_or_all(share: float) -> bool:
+    """Return whether a share is printed as 0 or 100 %, so that its error has one side only."""
+    return round(100.0 * share) in (0, 100)
+
+
 @dataclass(frozen=True)
 class NoticedShare:
     """The share of vehicles that people notice.
@@ -96,7 +101,10 @@ class NoticedShare:
         """The share with its error, at least :data:`TRANSFER_ERROR`, or a range, in per cent."""
         if not self.is_measured:
             return self.cell
-        return SCORE_LABELS[NOTICED].with_error(self.value, max(TRANSFER_ERROR, self.se or 0.0))
+        error = max(TRANSFER_ERROR, self.se or 0.0)
+        if is_none_or_all(self.value):
+            return format_range(max(0.0, self.value - error), self.value + error)
+        return SCORE_LABELS[NOTICED].with_error(self.value, error)
 
     @property
     def cell(self) -> str:
@@ -272,7 +280,7 @@ class DetectionLevel:
 def _format_found(share: float, error: float) -> str:
     if not math.isfinite(error):
         return NOT_MEASURED
-    if error > MAX_LEVEL_ERROR:
+    if error > MAX_LEVEL_ERROR or is_none_or_all(share):
         return format_range(max(0.0, share - error), share + error)
     return f"{100.0 * share:.0f} ± {math.ceil(round(100.0 * error, 6))} %"
 

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from egvs.core import polylines
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import by_number, format_percent, list_first, number_of
@@ -78,6 +79,7 @@ _AROUND_M = 20.0
 
 _ROAD_M = 300.0
 _STEP_M = 5.0
+_MAX_POINTS = 2_000_000
 _TOUCH_M = 1.0
 _LANE_REACH_M = 10.0
 _MAX_SAMPLES = 2000
@@ -126,11 +128,12 @@ class Reference:
 
 
 def lane_points_m(carriageway: Carriageway) -> FloatArray:
-    """Return points (n, 3) along the centre lines of all lanes, a few metres apart."""
+    """Return points (n, 3) along the centre lines of all lanes, a few metres apart; farther where there are many."""
+    step_m = max(_STEP_M, sum(polylines.length_m(lane.shape_m) for lane in carriageway.lanes) / _MAX_POINTS)
     points = []
     for lane in carriageway.lanes:
         starts, steps = lane.shape_m[:-1], np.diff(lane.shape_m, axis=0)
-        counts = np.ceil(np.hypot(steps[:, 0], steps[:, 1]) / _STEP_M).astype(int)
+        counts = np.ceil(np.hypot(steps[:, 0], steps[:, 1]) / step_m).astype(int)
         for start, step, count in zip(starts, steps, np.maximum(counts, 1), strict=True):
             points.append(start + step * (np.arange(count) / count)[:, None])
         points.append(lane.shape_m[-1:])

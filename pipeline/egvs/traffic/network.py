@@ -24,6 +24,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
+from egvs.core import polylines
 from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
 from egvs.core.polygons import PairCount, check_corners, check_edge_pairs
@@ -59,6 +60,7 @@ _PEDESTRIAN = "pedestrian"
 _MAP_ROOTS = ("osm", "OpenDRIVE")  # of OpenStreetMap and Lanelet2, and of OpenDRIVE
 _HINT = "Use a network that netconvert wrote."
 _MAX_PHASE_S = 1e9
+_MAX_LENGTH_M = 1e6
 # pairs of their edges are far below any limit
 _FEW_POINTS = 200
 
@@ -108,6 +110,9 @@ class Shape:
             shape_m = np.array(points, dtype=np.float64).reshape(-1, 3)
         except ValueError as error:
             raise InputError(self.where, f"invalid coordinates in a shape ({error})", _HINT) from None
+        if (length_m := polylines.length_m(shape_m[:, :2])) > _MAX_LENGTH_M:
+            problem = f"expected a shape of at most {_MAX_LENGTH_M:,.0f} m, got {length_m:,.0f} m"
+            raise InputError(self.where, problem, _HINT)
         if len(shape_m) > _FEW_POINTS:
             self._check_edges(shape_m)
         return shape_m

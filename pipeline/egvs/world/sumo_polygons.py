@@ -29,6 +29,7 @@ from egvs.core.polygons import PairCount, repair_polygon
 from egvs.core.wording import list_first
 from egvs.formats import xml
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference
+from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.traffic.network import Location, parse_location
 from egvs.world.footprints import CROSSING_RINGS, Footprint, FootprintFile, box_pairs, to_polygons
 from egvs.world.geolocation import StatedLocation, network_world_frame
@@ -212,12 +213,11 @@ class _PolygonReader:
         """Return what an outline encloses: each part where it crosses itself, nothing where it is flat."""
         from shapely import Polygon
 
-        if np.isfinite(points).all():
-            outline = Polygon(points)
-            outline = repair_polygon(outline, shape.where, self._count)
-        if np.isfinite(points).all() and outline.area == 0:
-            self._ignore("outlines that enclose nothing", shape.element.get("type", ""))
-            return []
+        if np.abs(points).max() <= MAX_COORDINATE_M:  # all others are refused below
+            outline = repair_polygon(Polygon(points), shape.where, self._count)
+            if outline.area == 0:
+                self._ignore("outlines that enclose nothing", shape.element.get("type", ""))
+                return []
         ring = points if points[0] == points[-1] else [*points, points[0]]
         repaired = self._file.repaired
         before = repaired[CROSSING_RINGS]
