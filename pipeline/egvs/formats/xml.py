@@ -124,7 +124,7 @@ def read_line(file: IO[bytes], where: object) -> bytes:
 def iter_elements(
     path: Path, root: str, name: Path | None = None, on_root: Callable[[Element], None] | None = None
 ) -> Iterator[Element]:
-    """Yield the children of the root element one by one; a child is cleared when the next is requested.
+    """Yield the children of the root element one by one, and forget them.
 
     Parameters
     ----------
