@@ -22,7 +22,6 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import IO, Any, cast
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
-from xml.parsers import expat
 
 from egvs.core import limits
 from egvs.core.digests import open_input
@@ -144,10 +143,12 @@ def iter_elements(
         large or too deep, its gzip is damaged, or its encoding is unknown.
     """
     children = _Children(name or path, root)
-    for _ in _parse(path, name, children):
+    for meter in _parse(path, name, children):
         if on_root is not None and children.root is not None:
             on_root(children.root)
             on_root = None
+        if children.complete:
+            meter.bytes_since_child = 0
         yield from children.pop()
 
 
@@ -155,84 +156,8 @@ def read_root_tag(path: Path) -> str:
     """Return the tag of the root, with its namespace as in ``{http://...}kml``; errors are those of iter_elements."""
     children = _Children(path, "")
     with closing(_parse(path, None, children)) as chunks:
-        next(_ for _ in chunks if children.root is not None)
-    assert children.root is not None, "a file without root is not well-formed"
-    return str(children.root.tag)
-
-
-def _parse(path: Path, name: Path | None, children: _Children) -> Generator[None, None, None]:
-    """Parse a file; yields after each piece of it."""
-    with _open_for_parser(path, name) as (meter, encoding):
-        parser = XMLParser(target=children, encoding=encoding)
-        while chunk := meter.read(_CHUNK_BYTES):
-            parser.feed(chunk)
-            if children.complete:
-                meter.bytes_since_child = 0
-            yield
-        parser.close()
-        yield
-
-
-class _Children:
-    """Collects the children of the root element; the target of a parser.
-
-    Parameters
-    ----------
-    where
-        The file, for messages.
-    root
-        Expected tag of the root; any if empty.
-    """
-
-    def __init__(self, where: object, root: str) -> None:
-        self._where, self._expected_root = where, root
-        self._builder = TreeBuilder()
-        self._depth, self._count, self._most = 0, 0, limits.XML_ELEMENTS.maximum
-        self.root: Element | None = None
-        self.complete: list[Element] = []
-        self.data, self.close = self._builder.data, self._builder.close
-
-    def start(self, tag: str, attributes: dict[str, str]) -> None:
-        self._count += 1
-        self._depth += 1
-        if self._count > self._most:
-            limits.XML_ELEMENTS.check(self._where, self._count, f"has more than {self._most:,} elements")
-        if self._depth > MAX_DEPTH:
-            raise InputError(self._where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
-        element = self._builder.start(tag, attributes)
-        if self.root is None:
-            _check_root(self._where, self._expected_root, tag)
-            self.root = element
-
-    def end(self, tag: str) -> None:
-        self._depth -= 1
-        element = self._builder.end(tag)
-        if self._depth == 1:
-            self.complete.append(element)
-
-    def doctype(self, *_: object) -> None:
-        raise _doctype_error(self._where)
-
-    def pop(self) -> list[Element]:
-        """Return the children that are complete, and forget them."""
-        complete, self.complete = self.complete, []
-        if complete and self.root is not None:
-            self.root.clear()
-        return complete
-
-
-@contextmanager
-def _open_for_parser(path: Path, name: Path | None) -> Iterator[tuple[_ElementMeter, str | None]]:
-    """Yield the file in an encoding that a parser reads, and that encoding if it is not the declared one."""
-    where = name or path
-    encoding = file_encoding(path, where)
-    with open_bounded(path, name) as file, translate_errors(where):
-        is_decoded = encoding not in PARSER_ENCODINGS
-        meter = _ElementMeter(Utf8Reader(file, encoding) if is_decoded else file, where)
-        try:
-            yield meter, "utf-8" if is_decoded else None
-        except (ParseError, expat.ExpatError) as error:
-            raise InputError(where, f"is not well-formed XML: {error}", COMPLETE_FILE) from None
+        root = next(children.root for _ in chunks if children.root is not None)
+        return str(root.tag)
 
 
 def scan_tags(path: Path, root: str, on_tag: Callable[[str, dict[str, str]], None], name: Path | None = None) -> None:
@@ -240,41 +165,90 @@ def scan_tags(path: Path, root: str, on_tag: Callable[[str, dict[str, str]], Non
 
     Much faster than :func:`iter_elements`. Parameters and errors are the same, but elements may be nested.
     """
+    tags, count = _Tags(name or path, root, on_tag), 0
+    for meter in _parse(path, name, tags):
+        if tags.count > count:
+            count, meter.bytes_since_child = tags.count, 0
+
+
+def _parse(path: Path, name: Path | None, target: _Tags) -> Generator[_ElementMeter, None, None]:
+    """Parse a file; yields after each piece of it what counts its bytes."""
     where = name or path
-    count, most = 0, limits.XML_ELEMENTS.maximum
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal count
-        count += 1
-        if count > most:
-            limits.XML_ELEMENTS.check(where, count, f"has more than {most:,} elements")
-        meter.bytes_since_child = 0
-        on_tag(tag, attributes)
-
-    def start_root(tag: str, attributes: dict[str, str]) -> None:
-        _check_root(where, root, tag)
-        parser.StartElementHandler = start
-        on_tag(tag, attributes)
-
-    def reject_doctype(*_: object) -> None:
-        raise _doctype_error(where)
-
-    with _open_for_parser(path, name) as (meter, encoding):
-        parser = expat.ParserCreate(encoding)
-        parser.StartElementHandler, parser.StartDoctypeDeclHandler = start_root, reject_doctype
-        while chunk := meter.read(_CHUNK_BYTES):
-            parser.Parse(chunk)
-        parser.Parse(b"", True)
+    encoding = file_encoding(path, where)
+    with open_bounded(path, name) as file, translate_errors(where):
+        is_decoded = encoding not in PARSER_ENCODINGS
+        meter = _ElementMeter(Utf8Reader(file, encoding) if is_decoded else file, where)
+        parser = XMLParser(target=target, encoding="utf-8" if is_decoded else None)
+        try:
+            while chunk := meter.read(_CHUNK_BYTES):
+                parser.feed(chunk)
+                yield meter
+            parser.close()
+        except ParseError as error:
+            raise InputError(where, f"is not well-formed XML: {error}", COMPLETE_FILE) from None
+        yield meter
 
 
-def _doctype_error(where: object) -> InputError:
-    problem = "declares XML entities or a document type, which are not allowed"
-    return InputError(where, problem, "Remove <!DOCTYPE ...> from the file.")
+class _Tags:
+    """Passes the start of each element on; the target of a parser.
+
+    Parameters
+    ----------
+    where
+        The file, for messages.
+    root
+        Expected tag of the root; any if empty.
+    on_tag
+        Called with the name and the attributes of each element.
+    """
+
+    def __init__(self, where: object, root: str, on_tag: Callable[[str, dict[str, str]], object]) -> None:
+        self._where, self._expected_root, self._on_tag = where, root, on_tag
+        self.count, self._most = 0, limits.XML_ELEMENTS.maximum
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        if self.count == 0 and self._expected_root and tag != self._expected_root:
+            problem = f"expected the root element <{self._expected_root}>, got <{tag}>"
+            raise InputError(self._where, problem, "Check the file name.")
+        self.count += 1
+        if self.count > self._most:
+            limits.XML_ELEMENTS.check(self._where, self.count, f"has more than {self._most:,} elements")
+        self._on_tag(tag, attributes)
+
+    def doctype(self, *_: object) -> None:
+        problem = "declares XML entities or a document type, which are not allowed"
+        raise InputError(self._where, problem, "Remove <!DOCTYPE ...> from the file.")
 
 
-def _check_root(where: object, expected: str, actual: str) -> None:
-    if expected and actual != expected:
-        raise InputError(where, f"expected the root element <{expected}>, got <{actual}>", "Check the file name.")
+class _Children(_Tags):
+    """Builds the children of the root element."""
+
+    def __init__(self, where: object, root: str) -> None:
+        super().__init__(where, root, self._open)
+        self._builder, self._depth = TreeBuilder(), 0
+        self.root: Element | None = None
+        self.complete: list[Element] = []
+        self.data, self.close = self._builder.data, self._builder.close
+
+    def _open(self, tag: str, attributes: dict[str, str]) -> None:
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise InputError(self._where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
+        element = self._builder.start(tag, attributes)
+        self.root = element if self.root is None else self.root
+
+    def end(self, tag: str) -> None:
+        self._depth -= 1
+        element = self._builder.end(tag)
+        if self._depth == 1:
+            self.complete.append(element)
+
+    def pop(self) -> list[Element]:
+        """Return the children that are complete, and forget them."""
+        complete, self.complete = self.complete, []
+        if complete and self.root is not None:
+            self.root.clear()
+        return complete
 
 
 def scan_attribute_values(path: Path, attribute: str) -> Iterator[bytes]:
