@@ -108,10 +108,12 @@ def _utf8(data: bytes) -> bytes:
 
 
 def rows(data: bytes) -> object:
-    """Cells of a CSV, each row as long as the header."""
-    table = [
-        [cell.strip() for cell in row] for row in csv.reader(io.StringIO(data.decode("utf-8-sig"), newline="")) if row
-    ]
+    """Cells of a CSV in UTF-8, or in a spreadsheet's Windows-1252, each row as long as the header."""
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("cp1252")
+    table = [[cell.strip() for cell in row] for row in csv.reader(io.StringIO(text, newline="")) if row]
     if any(len(row) != len(table[0]) for row in table):
         raise ValueError("rows of different lengths")
     return table

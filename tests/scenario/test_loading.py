@@ -177,3 +177,18 @@ def test_errors_name_the_command_line_for_keys_that_it_sets(mini: Path) -> None:
     assert scenario.locate("placement.count") == f"{mini / 'scenario.toml'}: placement.count"
     with pytest.raises(InputError, match=r"^command line: sites.file = 'poles.csv': no such file"):
         scenario.find("poles.csv", "sites.file")
+
+
+@pytest.mark.parametrize(
+    ("key", "hint"),
+    [
+        ("existing_poles='all'", "existing_poles: unknown key. Did you mean sites.existing_poles?"),
+        ("placement.existing_poles='all'", "placement.existing_poles: unknown key. Did you mean sites.existing_poles?"),
+        ("sites.heights=[3]", "sites.heights: unknown key. Did you mean heights_m?"),
+        ("placement.nothing_like_it=1", "placement.nothing_like_it: unknown key. Known keys are budget, count, "),
+    ],
+)
+def test_names_the_table_of_a_key_that_stands_elsewhere(key: str, hint: str) -> None:
+    with pytest.raises(InputError) as error:
+        loading.load("demo", [key])
+    assert hint in str(error.value)

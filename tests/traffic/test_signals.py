@@ -358,8 +358,13 @@ def test_german_table_gives_the_same_program(crossing, tmp_path):
         *(
             ("p.add.xml", f'<additional><tlLogic id="c"><phase duration="{text}" state="GG"/></tlLogic></additional>',
              f"invalid <tlLogic> (ValueError(\"duration = '{text}': expected seconds, above 0\"))")
-            for text in ("nan", "-0", "-5", "9223372036854775807")
+            for text in ("nan", "-0", "-5", "3e-06", "9223372036854775807")
         ),
+        ("p.add.xml", '<additional><tlLogic id="c" type="0"><phase duration="9" state="GG"/></tlLogic></additional>',
+         "invalid <tlLogic> (ValueError(\"type = '0': expected one of static, actuated, "),
+        ("p.add.xml",
+         '<additional><tlLogic id="c" offset="9e18"><phase duration="9" state="GG"/></tlLogic></additional>',
+         "invalid <tlLogic> (ValueError('offset = 9e+18: expected seconds, at most 1e+09'))"),
         ("p.add.xml", "<additional/>", "no <tlLogic> with phases for the signal High Street / Mill Lane (c)"),
         ("p.add.xml", '<additional><tlLogic id="c"><phase duration="9" state="GG"/></tlLogic></additional>',
          "expected a state of 20 letters, got 2"),

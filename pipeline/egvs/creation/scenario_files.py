@@ -60,6 +60,7 @@ _KEY_COMMENTS = {  # of tables and keys; the table of a key above all tables is 
     ("traffic", "teleport_s"): "the last resort against locks; vehicles that are moved on are counted",
     ("score", "rank_by"): "the expected share of vehicles that detectors find; docs/validity.md",
     ("score", "zones"): "results are also reported for these areas; edit, add or remove them as you like",
+    ("sites", "existing_poles"): "names of poles that stand already, or 'all': they cost nothing, and are not assumed",
     ("sites", "aim"): "sensors face the centre of the region",
     (
         "sites",
@@ -171,10 +172,9 @@ def sites_table(existing: Sequence[str] | None = None) -> TomlTable:
     """
     position = "columns longitude, latitude (degrees) work as well as x_m, y_m"
     poles = f"poles {junctions.KERB_M:g} m behind the kerbs of the junction"
-    keys: dict[str, Any] = {"file": SITES_FILE}
+    keys: dict[str, Any] = {"file": SITES_FILE, "existing_poles": list(existing or ())}
     if existing is not None:
         poles = "poles of the map; those that were moved (moved_m) are not among existing_poles before you checked them"
-        keys["existing_poles"] = list(existing)
     return f"{poles}; add or remove rows as you like; {position}", keys
 
 
@@ -193,7 +193,8 @@ def score_table(zones_file: str | None = None) -> TomlTable:
 
 def placement_table() -> TomlTable:
     """Return ``[placement]``: without a limit, a plan may put two sensors in the same place."""
-    return "rules for egvs place", {"most_per_pole": 1}
+    comment = 'rules for egvs place; for --budget, add a table [costs]: sensor = {"VLP-32C" = 8000}, pole = 2000'
+    return comment, {"most_per_pole": 1}
 
 
 def toml_document(comments: Sequence[str], values: Mapping[str, Any], tables: Mapping[str, TomlTable]) -> Any:

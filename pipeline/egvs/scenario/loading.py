@@ -147,13 +147,12 @@ def _suggest_key(location: Sequence[str | int], top: type[BaseModel]) -> str:
     """Return a hint at the key of ``top`` that the user may have meant."""
     key = str(location[-1])
     fields = top.model_fields
-    if len(location) == 1:
-        tables = [f"{name}.{key}" for name, table in fields.items() if key in _table_fields(table.annotation)]
-        if tables:
-            return f"Did you mean {' or '.join(tables)}?"
+    tables = [f"{name}.{key}" for name, table in fields.items() if key in _table_fields(table.annotation)]
     for part in location[:-1]:
         if part in fields:
             fields = _table_fields(fields[str(part)].annotation)
+    if tables and (len(location) == 1 or not difflib.get_close_matches(key, sorted(fields), 1, 0.8)):
+        return f"Did you mean {' or '.join(tables)}?"
     similar = difflib.get_close_matches(key, sorted(fields), 1, 0.5)
     return f"Did you mean {similar[0]}?" if similar else f"Known keys are {', '.join(sorted(fields))}."
 

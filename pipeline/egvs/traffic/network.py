@@ -59,7 +59,8 @@ _PEDESTRIAN = "pedestrian"
 
 _MAP_ROOTS = ("osm", "OpenDRIVE")  # of OpenStreetMap and Lanelet2, and of OpenDRIVE
 _HINT = "Use a network that netconvert wrote."
-_MAX_PHASE_S = 1e9
+MAX_PHASE_S = 1e9
+_MIN_PHASE_S = 1e-3  # SUMO's smallest step
 _MAX_LENGTH_M = 1e6
 # pairs of their edges are far below any limit
 _FEW_POINTS = 200
@@ -512,7 +513,7 @@ class _Phase(NamedTuple):
 def parse_phase_s(key: str, text: str) -> float:
     """Return a duration of a phase of a signal; ValueError where SUMO would reject it."""
     value = float(text)
-    if not 0.0 <= value <= _MAX_PHASE_S or (key == "duration" and value == 0.0):
+    if not (_MIN_PHASE_S if key == "duration" else 0.0) <= value <= MAX_PHASE_S:
         raise ValueError(f"{key} = {text[:80]!r}: expected seconds, above 0")
     return value
 

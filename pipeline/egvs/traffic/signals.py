@@ -32,6 +32,12 @@ YELLOW_LETTERS = frozenset("yY")
 CROSSING = "crosswalk"
 MOVEMENTS = ("left", "straight", "right", U_TURN, CROSSING)
 
+PROGRAM_TYPES = (
+    "static", "actuated", "delay_based", "NEMA", "sotl_phase", "sotl_platoon", "sotl_request", "sotl_wave",
+    "sotl_marching", "swarm", "deterministic", "off", "railSignal", "railCrossing",
+)  # fmt: skip
+"""Types of ``<tlLogic>`` that SUMO 1.26 knows."""
+
 _PROGRAM = re.compile(r"    <tlLogic id=(\"[^\"]*\").*?</tlLogic>\n", re.DOTALL)
 
 
@@ -131,7 +137,12 @@ class Program:
             if param.get("key") != CLOCK_PARAM
         )
         clock = SignalClock.from_program(element)
-        return cls(element.get("type", "static"), float(element.get("offset", "0")), tuple(phases), clock, params)
+        kind, offset_s = element.get("type", "static"), float(element.get("offset", "0"))
+        if kind not in PROGRAM_TYPES:
+            raise ValueError(f"type = {kind[:80]!r}: expected one of {', '.join(PROGRAM_TYPES)}")
+        if not abs(offset_s) <= network.MAX_PHASE_S:
+            raise ValueError(f"offset = {offset_s:g}: expected seconds, at most {network.MAX_PHASE_S:g}")
+        return cls(kind, offset_s, tuple(phases), clock, params)
 
     @property
     def longest_s(self) -> tuple[float, ...]:

