@@ -164,7 +164,7 @@ def town() -> OsmExtract:
         ring(7, (2300, 0), house, 50.0),
         ring(8, (2310, 10), {"building:part": "yes"}),
         ring(9, (2400, 0), house | {"location": "underground"}),
-        ring(10, (2500, 0), {"building": "ruins"}),
+        ring(10, (2500, 0), {"building": "razed"}),
         ring(11, (2600, 0), {}),
         ring(12, (2605, 2), {}, 3.0),
         ring(13, (-50, -900), {"landuse": "forest"}, 1800.0),
@@ -199,4 +199,4 @@ def test_far_objects_are_counted_as_if_they_were_made() -> None:
     far = Counter(solid.kind for solid in every if not window.intersects(solid.area))
     assert counts.dropped.pop("out_of_range") == far - Counter(tree_trunk=1, tree_crown=1) + Counter(tree=1)
     assert counts.dropped == {"underground": {"building": 1}, "incomplete": {"building": 3}}
-    assert counts.unreadable == {"height": 1} and counts.not_modelled == {"building=ruins": 1}
+    assert counts.unreadable == {"height": 1} and counts.not_modelled == {"building=razed": 1}
