@@ -13,7 +13,7 @@ unexport PYTHONDONTWRITEBYTECODE
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
 
-EXTENSIONS := city hardware maps tracks validation
+EXTENSIONS := city desk hardware maps tracks validation
 TRAINING := tests/extensions/validation/training
 # Pages, studies and damaged files of all parts of the program.
 COMPLETE_TESTS := tests/benchmarks tests/docs tests/fuzz tests/install

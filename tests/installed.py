@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 import pytest
 
-EXTENSIONS = ("city", "hardware", "maps", "tracks", "validation")
+EXTENSIONS = ("city", "desk", "hardware", "maps", "tracks", "validation")
 
 
 def needs(*extensions: str) -> pytest.MarkDecorator:

@@ -419,11 +419,42 @@ def test_lists_junctions_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.
         "opens the maps", "reads the roads", "lists the junctions"
     ]  # fmt: skip
     assert not list(tmp_path.iterdir())
-    assert run_egvs("new", "--list", "--from", SMALL, "--at", "52.0,10.0")[0] == 2
     for option in ("--track-crs", "--track-columns", "--pedestrian-tracks", "--overpass"):
         assert f"{option}: has no effect with --list" in run_egvs("new", "--list", "--from", SMALL, option, "any")[2]
     assert "FOLDER: no folder is given" in run_egvs("new", "--from", SMALL)[2]
     assert "no map is given" in run_egvs("new", "--list")[2]
+
+
+def test_lists_the_nearest_junctions_of_a_point_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs
+) -> None:
+    """Three crossings of one road, 278, 0 and 556 m west of the point (111.3 km per degree on the equator)."""
+    write_crossroads(tmp_path / "three.osm", [9.9975, 10.0, 9.995])
+    at = ("--at", "0.0,10.0")
+    code, printed, error = run_egvs("new", "--from", tmp_path / "three.osm", "--list", *at)
+    assert code == 0, error
+    rows = [line.split() for line in printed.splitlines()[1:4]]
+    assert [row[0] for row in rows] == ["0.00000,10.00000", "0.00000,9.99750", "0.00000,9.99500"]
+    assert [int(row[1]) for row in rows] == pytest.approx([0, 278, 556], abs=15)  # to the edge of the junction
+    monkeypatch.setattr("egvs.creation.new_scenario.MOST_LISTED_NEARBY", 2)
+    assert "2 junctions" in run_egvs("new", "--from", tmp_path / "three.osm", "--list", *at)[1]
+    assert "outside the extract" in run_egvs("new", "--from", tmp_path / "three.osm", "--list", "--at", "60,10")[2]
+
+
+def write_crossroads(path: Path, lons_deg: list[float]) -> None:
+    """Write a map of a road along the equator, crossed by one road at each longitude."""
+    middle = {number: lon_deg for number, lon_deg in enumerate(sorted([9.99, *lons_deg, 10.005]), 1)}
+    nodes = [(number, 0.0, lon_deg) for number, lon_deg in middle.items()]
+    ways = [(100, "Equator Road", list(middle))]
+    for number, lon_deg in list(middle.items())[1:-1]:
+        nodes += [(number + 10, 0.002, lon_deg), (number + 20, -0.002, lon_deg)]
+        ways.append((100 + number, f"Road {number}", [number + 10, number, number + 20]))
+    lines = [f'<node id="{number}" version="1" lat="{lat}" lon="{lon}"/>' for number, lat, lon in nodes]
+    for number, name, refs in ways:
+        refs_text = "".join(f'<nd ref="{ref}"/>' for ref in refs)
+        tags = f'<tag k="highway" v="secondary"/><tag k="name" v="{name}"/>'
+        lines.append(f'<way id="{number}" version="1">{refs_text}{tags}</way>')
+    path.write_text(f'<osm version="0.6">{"".join(lines)}</osm>', encoding="utf-8")
 
 
 def test_roads_without_buildings_and_trees_assume_open_surroundings(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ Change = Callable[[random.Random, bytes], bytes]
 Inner = Callable[[random.Random, bytes], bytes]
 
 _TAG = re.compile(r"<(/?)([A-Za-z_][\w:.-]*)((?:[^<>\"']|\"[^\"]*\"|'[^']*')*?)(/?)>")
-_ATTRIBUTE = re.compile(r"([\w:.-]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
+_ATTRIBUTE = re.compile(r"(?<![\w:.-])([\w:.-]+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 _MOST_ELEMENTS = 20_000
 
 HOSTILE_TEXTS = (

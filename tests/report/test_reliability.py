@@ -31,6 +31,8 @@ def test_nothing_is_said_of_a_level_site_between_the_limits() -> None:
         ([(3, 0), (4, 0)], "the lowest height tried (z 3 m)"),
         ([(4, 0), (3, 0)], "the greatest height tried (z 4 m)"),
         ([(3, -10), (3, 0)], "the steepest tilt tried (-10 degrees)"),
+        ([(3, 0), (3, -10)], "the least tilt tried (0 degrees)"),
+        ([(4, -10), (3, -20), (4, -15)], "the greatest height tried (z 4 m) and the least tilt tried (-10 degrees)"),
         ([(3, -10), (4, 0)], "the lowest height tried (z 3 m) and the steepest tilt tried (-10 degrees)"),
     ],
 )

@@ -270,11 +270,30 @@ def test_rejects_visibility_of_dropped_site(street: Path) -> None:
 def test_warns_of_beams_that_miss_region(street: Path) -> None:
     sensor = "{elevations_deg=[5,15],channels=4,azimuth_step_deg=1.0,range_m=100}"
     told = found(street, f"sensors.small={sensor}", "roi.center_m=[20,0,1.0]", "roi.size_m=[40,20,2]")
+    assert told.pop("upward beams") == [
+        "[sensors.small: 100 % of the beams point above the horizon at 2 sites: pole_a, pole_b]"
+    ]
     assert told == {
         "beams beside the region": [
             "[sites: 2 of 2 sites have no beam that meets the region of interest: pole_a, pole_b]"
         ]
     }
+
+
+def test_warns_once_of_a_sensor_whose_beams_point_up_where_it_hangs(street: Path) -> None:
+    """Of 4 elevations from -25 to 5 degrees one points up, and three upside down; RS-Ruby Plus is made so."""
+    rows = ["a,20,12,3,0,inverted,wide", "b,25,12,3,0,inverted,wide", "c,30,12,3,0,upright,wide"]
+    rows += [
+        "d,35,12,3,0,upright,RS-Ruby Plus",
+        "g,40,12,3,0,upright,",
+        "e,20,12,6,0,inverted,VLP-16",
+        "f,25,12,6,-5,upright,OS1-64",
+    ]
+    (street / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m,pitch_deg,mount,sensor", *rows, ""]))
+    told = found(street, "sensors.wide={elevations_deg=[-25,5],channels=4,azimuth_step_deg=0.5,range_m=100}")
+    assert told["upward beams"] == [
+        "[sensors.wide: 75 % of the beams point above the horizon at 2 sites (upside down): a, b]"
+    ]
 
 
 def test_reports_all_wrong_poses_at_once(street: Path) -> None:

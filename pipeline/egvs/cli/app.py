@@ -412,9 +412,14 @@ def _unmeasured_effects(statuses: Sequence[EffectStatus], costs: Collection[str]
 
 @app.command()
 def explore(
+    context: typer.Context,
     folder: Annotated[
-        Path, typer.Argument(metavar="RUN|SCENARIO", help="Folder of a run, or a scenario, which is run first.")
-    ],
+        Path | None,
+        typer.Argument(
+            metavar="RUN|SCENARIO",
+            help="Folder of a run, or a scenario, which is run first; without it, the page of egvs desk is opened.",
+        ),
+    ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 for any.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
     out: Out = None,
@@ -434,6 +439,11 @@ def explore(
     from egvs.cli.console import ProgressDisplay
     from egvs.core import files, plugins
 
+    if folder is None:
+        if to is not None or out is not None or set_ or jobs or view:
+            raise InputError("RUN|SCENARIO", "no folder is given", "Name a run or a scenario.")
+        _open_start_page(context, port, browser=browser)
+        return
     plugins.require_libraries("egvs explore", "explore", "viser", "PIL")
     from egvs.cli import answer, sources
     from egvs.explore.page import Page, check_port_free
@@ -463,6 +473,15 @@ def explore(
             print()
         finally:
             page.stop()
+
+
+def _open_start_page(context: typer.Context, port: int, *, browser: bool) -> None:
+    """Call ``egvs desk``, a command of an extension."""
+    group = context.find_root()
+    command = group.command.get_command(group, "desk")  # type: ignore[attr-defined]
+    if command is None:
+        raise InputError("RUN|SCENARIO", "no folder is given", "Name a run or a scenario.")
+    command.callback(folder=Path(), port=port, browser=browser)
 
 
 def _write_page_file(
@@ -745,7 +764,9 @@ def new(
     list_: Annotated[
         bool,
         typer.Option(
-            "--list", help="List the junctions of the road map: names, arms, signals, --at. Nothing is written."
+            "--list",
+            help="List the junctions of the road map: names, arms, signals, --at. With --at, the nearest first."
+            " Nothing is written.",
         ),
     ] = False,
     run_: Annotated[
@@ -764,7 +785,7 @@ def new(
     paths = [*(maps or []), *(more or [])]
     if list_:
         others = {
-            "--at": at, "--download": download, "--surroundings": surroundings, "--traffic": traffic, "--run": run_,
+            "--download": download, "--surroundings": surroundings, "--traffic": traffic, "--run": run_,
             "--vehicles-per-hour": vehicles_per_hour, "--counts": counts, "--poles": poles, "--tracks": tracks,
             "--like": like, "--signals": signals, "--align": align, "--surface": surface, "--overpass": overpass_url,
             "--pedestrian-tracks": pedestrian_tracks, "--track-columns": track_columns, "--track-crs": track_crs,
@@ -772,7 +793,8 @@ def new(
         for option in filter(others.get, others):
             raise InputError(option, "has no effect with --list", "Remove one of them.")
         maps_given = [*(maps or []), *([folder] if folder else []), *(more or [])]  # --from A B takes B for the folder
-        _list_junctions(maps_given, NewScenarioOptions(lefthand=lefthand, righthand=righthand, walk=walk))
+        near = None if at is None else cli_options.latitude_and_longitude(at)
+        _list_junctions(maps_given, NewScenarioOptions(lefthand=lefthand, righthand=righthand, walk=walk), near)
         return
     if folder is None:
         raise InputError("FOLDER", "no folder is given", "Name the folder of the new scenario, or use --list.")
@@ -820,7 +842,7 @@ def new(
         run(folder)
 
 
-def _list_junctions(paths: Sequence[Path], options: NewScenarioOptions) -> None:
+def _list_junctions(paths: Sequence[Path], options: NewScenarioOptions, at: tuple[float, float] | None = None) -> None:
     from egvs.cli import new_summary
     from egvs.cli.console import ProgressDisplay
     from egvs.creation.new_scenario import list_junctions
@@ -828,7 +850,7 @@ def _list_junctions(paths: Sequence[Path], options: NewScenarioOptions) -> None:
     if not paths:
         raise InputError("--from", "no map is given", "Give a map of the roads, such as --from town.osm.")
     with ProgressDisplay("new", prints_progress=True) as screen:
-        listed = list_junctions(paths, options, screen.progress)
+        listed = list_junctions(paths, options, screen.progress, at)
     new_summary.print_junctions(listed)
 
 

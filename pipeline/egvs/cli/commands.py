@@ -36,6 +36,7 @@ MODULES = {"compare": "egvs.cli.compare", "place": "egvs.cli.place", "what-if": 
 
 SHIPPED = {
     "city": ("city",),
+    "desk": ("desk",),
     "hardware": ("accept", "sensor", "sheets"),
     "validation": ("clouds", "scores", "train", "validate"),
 }

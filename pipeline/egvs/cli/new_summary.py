@@ -52,6 +52,8 @@ def print_junctions(listed: Sequence[ListedJunction]) -> None:
         Column("signals", lambda junction: "yes" if junction.signalised else "-", "left"),
         Column("junction", lambda junction: junction.title, "left", wrap=True),
     ]
+    if any(junction.distance_m is not None for junction in listed):
+        columns.insert(1, Column("m away", lambda junction: f"{junction.distance_m or 0.0:,.0f}"))
     print_table(columns, listed, file_width=_FILE_WIDTH)
     print(f"{number_of(len(listed), 'junction')}; egvs new FOLDER --from ... --at LAT,LON makes a scenario of one")
 

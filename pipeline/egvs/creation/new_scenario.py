@@ -475,19 +475,58 @@ def create_scenario(
 
 @dataclass(frozen=True)
 class ListedJunction:
-    """A junction of a map: its description, arms and incoming lanes, signals, and the value of ``--at`` there."""
+    """A junction of a map: its description, arms and incoming lanes, signals, and the value of ``--at`` there.
+
+    ``distance_m`` is from the position that was asked for; None without one.
+    """
 
     title: str
     arms: int
     lanes_in: int
     signalised: bool
     at: str
+    distance_m: float | None = None
+
+
+MOST_LISTED_NEARBY = 20
+"""Most junctions around a position that are listed."""
+
+_LISTED_REACH_M = 2000.0
+"""Of an OpenStreetMap extract, only streets up to this far from the position are read."""
 
 
 def list_junctions(
-    maps: Sequence[str | Path], options: NewScenarioOptions | None = None, progress: ProgressCallback = no_progress
+    maps: Sequence[str | Path],
+    options: NewScenarioOptions | None = None,
+    progress: ProgressCallback = no_progress,
+    at: tuple[float, float] | None = None,
 ) -> list[ListedJunction]:
-    """Return the junctions of a road map of which a scenario can be made, the largest first; nothing is written.
+    """Return the junctions of a road map of which a scenario can be made; nothing is written.
+
+    The largest come first; with ``at``, the nearest, at most :data:`MOST_LISTED_NEARBY`. Parameters and errors are
+    those of :func:`read_map_streets`.
+    """
+    streets = read_map_streets(maps, options, progress, at)
+    progress("lists the junctions", 0, 0)
+    listed = [
+        ListedJunction(
+            junction.title, junction.arms, junction.lanes_in, junction.signalised,
+            _at_option(streets, junction.at_m), _distance_m(streets, junction, at),
+        )
+        for junction in junctions.distinct_crossings(streets)
+    ]  # fmt: skip
+    if at is None:
+        return listed
+    return sorted(listed, key=lambda junction: junction.distance_m or 0.0)[:MOST_LISTED_NEARBY]
+
+
+def read_map_streets(
+    maps: Sequence[str | Path],
+    options: NewScenarioOptions | None = None,
+    progress: ProgressCallback = no_progress,
+    at: tuple[float, float] | None = None,
+) -> Streets:
+    """Return the streets of a road map; nothing is written.
 
     Parameters
     ----------
@@ -497,27 +536,23 @@ def list_junctions(
         ``lefthand``, ``righthand`` and ``walk`` are used.
     progress
         Called at the beginning of each step.
+    at
+        As for :func:`create_scenario`: of an OpenStreetMap extract, only streets near it are read.
 
     Raises
     ------
     InputError
-        When a file is damaged or of an unknown format, or the road map has no drivable streets.
+        When a file is damaged or of an unknown format, the road map has no drivable streets, or ``at`` is outside.
     """
     options = options or NewScenarioOptions()
     with unpack_archives([Path(path) for path in maps]) as unpacked:
         progress("opens the maps", 0, 0)
         files = map_readers.open_maps(unpacked.paths)
         progress("reads the roads", 0, 0)
-        road_options = RoadOptions(options.lefthand, options.walk, bool(files.terrain), None, options.righthand)
-        streets = _read_roads(files.roads, road_options).streets
-        progress("lists the junctions", 0, 0)
-        return [
-            ListedJunction(
-                junction.title, junction.arms, junction.lanes_in, junction.signalised,
-                _at_option(streets, junction.at_m),
-            )
-            for junction in junctions.distinct_crossings(streets)
-        ]  # fmt: skip
+        road_options = RoadOptions(
+            options.lefthand, options.walk, bool(files.terrain), at, options.righthand, _LISTED_REACH_M
+        )  # fmt: skip
+        return _read_roads(files.roads, road_options).streets
 
 
 def _open_files(

@@ -140,9 +140,11 @@ def _limits(best: RankedSite, on_pole: Sequence[RankedSite]) -> Iterator[str]:
     if len(heights_m) > 1 and best.z_m in (min(heights_m), max(heights_m)):
         end = "lowest" if best.z_m == min(heights_m) else "greatest"
         yield f"the {end} height tried (z {best.z_m:.4g} m)"
-    steepest_deg = min(site.pitch_deg for site in on_pole)
-    if best.pitch_deg == steepest_deg <= -MIN_TILT_DEG and any(site.pitch_deg > steepest_deg for site in on_pole):
-        yield f"the steepest tilt tried ({best.pitch_deg:.0f} degrees)"
+    pitches_deg = {site.pitch_deg for site in on_pole}
+    steepest_deg, flattest_deg = min(pitches_deg), max(pitches_deg)
+    if steepest_deg < flattest_deg and steepest_deg <= -MIN_TILT_DEG and best.pitch_deg in (steepest_deg, flattest_deg):
+        end = "steepest" if best.pitch_deg == steepest_deg else "least"
+        yield f"the {end} tilt tried ({best.pitch_deg:z.0f} degrees)"
 
 
 # ---- warnings
@@ -161,7 +163,7 @@ _BY_SEVERITY = (
         "traffic through solids",
     ),
     ("sites on lanes", "blocked sites", "measured scan", "vehicles off their lanes", "vehicles against lanes"),
-    ("mesh units", "mesh axes", "few beams", "beam angles", "blind sites", "track alignment"),
+    ("mesh units", "mesh axes", "few beams", "beam angles", "upward beams", "blind sites", "track alignment"),
 )
 """Rules of warnings that make a result worthless, that tell of traffic that cannot be, of sites where no sensor can
 stand, and of scenes that are not as they are in reality; all other warnings are less serious."""

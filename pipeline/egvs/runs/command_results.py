@@ -47,7 +47,7 @@ def add_to_report(
     ------
     InputError
         If the file in the folder is damaged.
-    RunError
+    FolderInUseError
         If another command is still at work in the folder.
     """
     with lock_run_folder(folder, LOCK_WAIT_S):

@@ -523,6 +523,10 @@ def _is_intact(context: StageContext, stage: StageRecord) -> bool:
     return all(context.path(name).is_file() and context.digest(name) == digest for name, digest in digests.items())
 
 
+class FolderInUseError(RunError):
+    """Another run is at work in a run folder."""
+
+
 @contextmanager
 def lock_run_folder(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
     """Keep other runs out of a folder, and every run out of the folder of the store.
@@ -536,7 +540,7 @@ def lock_run_folder(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
 
     Raises
     ------
-    RunError
+    FolderInUseError
         When another run is still at work there.
     """
     store.check_outside_store(folder)
@@ -550,12 +554,12 @@ def lock_run_folder(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
 
 
 def _lock_folder(folder: Path, wait_s: float) -> int:
-    """Return the descriptor of the lock of a run folder; RunError when another run holds it."""
+    """Return the descriptor of the lock of a run folder; FolderInUseError when another run holds it."""
     while True:
         descriptor = _open_folder_lock(folder)
         if not locks.wait_for_lock(descriptor, wait_s):
             os.close(descriptor)
-            raise RunError(f"{folder}: another run is using this folder")
+            raise FolderInUseError(f"{folder}: another run is using this folder")
         if locks.is_current_lock(descriptor, folder / RunFolder.lock.name):
             return descriptor
         os.close(descriptor)  # a run that wrote nothing has removed the folder meanwhile

@@ -50,6 +50,7 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     scene_checks.check_poses,
     scene_checks.warn_radians,
     scene_checks.warn_nose_up,
+    scene_checks.warn_upward_beams,
     scene_checks.warn_equal_sites,
     scene_checks.warn_sites_on_lanes,
     scene_checks.warn_own_supports,

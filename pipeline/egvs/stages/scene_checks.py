@@ -28,7 +28,7 @@ from egvs.kernels import ray_triangle
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.sensors import sensor, site_feasibility
 from egvs.sensors.scene import Scene
-from egvs.sensors.sensor import Sensor, scenario_sensor
+from egvs.sensors.sensor import Sensor, rotation_world_sensor, scenario_sensor
 from egvs.sensors.sites import Site
 from egvs.stages import scene_inputs, solid_readings
 from egvs.stages.inputs import CheckInputs, ErrorCollector
@@ -250,6 +250,51 @@ def warn_nose_up(inputs: CheckInputs) -> Iterator[Diagnostic]:
         listed = list_first(names, MAX_LISTED_SITES)
         problem = f"{number_of(len(names), 'sensor')} {verb} more than {low_deg:g} degrees up: {listed}"
         yield Diagnostic("nose up", "sites", problem, "Positive pitch_deg is nose up; use a negative one to look down.")
+
+
+_MAX_UPWARD_SHARE = 0.51
+"""Largest share of beams above the horizon without a warning: half of them, and a margin for offsets of azimuths."""
+
+_HORIZONTAL = 1e-9
+
+
+def warn_upward_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about each sensor most of whose beams, as mounted, point above the horizon; of the catalogue, by its mount.
+
+    Sensors that are pitched far up are left to :func:`warn_nose_up`.
+    """
+    if inputs.scene is None:
+        return
+    low_deg, high_deg = NOSE_UP_DEG
+    upward: dict[str, dict[str, float]] = {}
+    sites = {site.name: site for site in inputs.sites if site.points is None}
+    for name, site in sites.items():
+        try:
+            mounted = inputs.scene.sensor(site.sensor)
+        except InputError:
+            continue  # check_sensors_known reports it
+        share = _upward_share(mounted, site.pose.pitch_deg, site.pose.roll_deg)
+        most = _MAX_UPWARD_SHARE
+        if site.sensor not in inputs.scenario.sensors:
+            most = max(most, _upward_share(mounted, 0.0, 0.0))
+        if share > most and not low_deg < site.pose.pitch_deg < high_deg:
+            upward.setdefault(site.sensor, {})[name] = share
+    for sensor_name, shares in upward.items():
+        mount = " (upside down)" if all(sites[name].pose.is_inverted for name in shares) else ""
+        least, greatest = (format_percent(end(shares.values()), 0) for end in (min, max))
+        problem = (
+            f"{least if least == greatest else f'{least} to {greatest}'} of the beams point above the horizon at"
+            f" {number_of(len(shares), 'site')}{mount}: {list_first(list(shares), MAX_LISTED_SITES)}"
+        )
+        hint = 'Elevations are those of the upright sensor; mount = "inverted" or roll_deg = 180 turns them over.'
+        yield Diagnostic("upward beams", f"sensors.{sensor_name}", problem, hint)
+
+
+@lru_cache(maxsize=1024)
+def _upward_share(sensor: Sensor, pitch_deg: float, roll_deg: float) -> float:
+    """Return the share of the beams of a mounted sensor that point above the horizon."""
+    up = rotation_world_sensor(0.0, pitch_deg, roll_deg)[2]
+    return float(np.mean(_cached_directions(sensor, (0.0, 0.0, 0.0)) @ up > _HORIZONTAL))
 
 
 MIN_RADIANS_YAW = 1.5

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from egvs.extensions.hardware.installation.acceptance import Acceptance, Check
 
 _LIMITS = Limits()
+_IN_USE_HINT = "Repeat egvs accept when it has ended."
 
 
 def sheets(
@@ -70,7 +73,7 @@ def accept(
         float, typer.Option(metavar="M", min=0, help="Largest error of the position.")
     ] = _LIMITS.position_m,
     tilt: Annotated[
-        float, typer.Option(metavar="DEG", min=0, help="Largest angle between the planned and the measured z axis.")
+        float, typer.Option(metavar="DEG", min=0, help="Largest turn that is left without the error of the yaw.")
     ] = _LIMITS.tilt_deg,
     yaw: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of the yaw.")] = _LIMITS.yaw_deg,
     blocked: Annotated[
@@ -108,6 +111,7 @@ def accept(
     with ProgressDisplay("accept") as screen:
         from egvs.core import files
         from egvs.extensions.hardware.installation import acceptance, acceptance_page
+        from egvs.runs.run import FolderInUseError
 
         if not scan:
             raise InputError("--scan", "no scan is given", "Use --scan measured.pcd.")
@@ -122,15 +126,35 @@ def accept(
         limits = Limits(position, tilt, yaw, blocked, missing_channels, returns, off_beams, loss)
         folder = out or run / "acceptance"
         files.check_writable(acceptance_page.AcceptanceFiles.of(folder, site).json)
+        _check_not_in_use(run)
         result = acceptance.accept(
             run, site, scan, limits, max_vehicle_height_m=vehicle_height, progress=screen.progress
         )  # fmt: skip
-        written = acceptance_page.write_acceptance(run, result, folder)
+        written: Sequence[Path] = ()
+        with contextlib.suppress(FolderInUseError):  # by a command that began meanwhile
+            written = acceptance_page.write_acceptance(run, result, folder)
     _print_acceptance(result)
     for path in written:
         print(path)
+    if not written:
+        problem = "another command is using this folder, so its report lacks this verdict"
+        raise InputError(run, problem, _IN_USE_HINT)
     if not result.passed:
         raise typer.Exit(EgvsError.exit_code)
+
+
+def _check_not_in_use(run: Path) -> None:
+    """Raise an InputError if another command is at work in a run folder, to which the verdict is added."""
+    from egvs.artefacts.run_folder import RunFolder
+    from egvs.runs.run import FolderInUseError, lock_run_folder
+
+    if not RunFolder(run).has_record:
+        return
+    try:
+        with lock_run_folder(run):
+            pass
+    except FolderInUseError:
+        raise InputError(run, "another command is using this folder", _IN_USE_HINT) from None
 
 
 def _print_acceptance(result: Acceptance) -> None:

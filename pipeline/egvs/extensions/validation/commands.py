@@ -258,7 +258,15 @@ def clouds(
     ] = None,
     frames: Annotated[int, typer.Option(min=1, help=_FRAMES_HELP)] = DEFAULT_FRAMES,
     spacing: Spacing = None,
-    kind: Annotated[str, typer.Option("--format", metavar="FORMAT", help="kitti, openpcdet, ply or pcd.")] = "kitti",
+    kind: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="FORMAT",
+            help="kitti, openpcdet, ply or pcd. Points are in a levelled frame at the sensor; turn them back by pitch"
+            " and roll for egvs accept.",
+        ),
+    ] = "kitti",
     set_: Set = None,
     jobs: Jobs = None,
 ) -> None:

@@ -17,11 +17,12 @@ import egvs
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.extensions import hardware
-from egvs.extensions.hardware.installation import acceptance, scan_comparison
+from egvs.extensions.hardware.installation import acceptance, acceptance_page, scan_comparison
 from egvs.extensions.hardware.installation.acceptance import Acceptance, PoseError, accept
 from egvs.extensions.hardware.installation.acceptance_limits import Limits
 from egvs.extensions.hardware.installation.scan_comparison import ScanComparison, StaticWorld
-from egvs.extensions.hardware.registration import PARAMETERS, StaticSurfaces, register_scan
+from egvs.extensions.hardware.registration import PARAMETERS, Registration, StaticSurfaces, register_scan
+from egvs.runs.run import FolderInUseError, lock_run_folder
 from egvs.scoring.visibility import Beams
 from egvs.sensors.beam_files import BeamTable
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
@@ -183,6 +184,23 @@ ENDLESS = (-math.inf, math.inf)
 CORRIDOR = (-8.0, 6.0)
 
 
+@pytest.mark.parametrize(
+    ("yaw_error_deg", "pitch_error_deg", "roll_error_deg", "tilt_deg"),
+    [(3.0, 0.0, 0.0, 0.0), (0.0, 1.5, 0.0, 1.5), (3.0, 1.5, 0.0, 1.5), (3.0, 0.0, 1.5, 1.5), (90.0, 0.0, 0.0, 0.0)],
+)
+@pytest.mark.parametrize("roll_deg", [0.0, 180.0])
+def test_yaw_error_of_a_tilted_sensor_is_no_tilt(
+    roll_deg: float, yaw_error_deg: float, pitch_error_deg: float, roll_error_deg: float, tilt_deg: float
+) -> None:
+    planned = Pose(0.0, 0.0, 4.0, 30.0, -20.0, roll_deg)
+    measured = Pose(0.0, 0.0, 4.0, 30.0 + yaw_error_deg, -20.0 + pitch_error_deg, roll_deg + roll_error_deg)
+    fit = Registration(measured, 1e-4 * np.eye(6), (), np.zeros(1), np.ones(1, dtype=np.bool_), 0.01, 0.01, True)
+    error = PoseError.of(planned, fit)
+    assert error.values["yaw_deg"] == pytest.approx(yaw_error_deg)
+    assert error.tilt_deg == pytest.approx(tilt_deg)
+    assert error.tilt_se_deg == pytest.approx(0.01 if tilt_deg else 0.0, rel=1e-3)
+
+
 def test_direction_that_no_wall_fixes_fails_the_position() -> None:
     """Between two endless walls along x, nothing tells that the sensor is 1.5 m further along x."""
     planned = Pose(3.0, 1.0, 4.0, 20.0, -1.0, 0.5)
@@ -273,6 +291,29 @@ def test_command_prints_reason_and_writes_files(installed: InstalledRun, run_egv
     assert f"<dt>Yaw error</dt><dd>{yaw_error:+z.2f} degrees</dd>" in page  # never -0.00
     code, printed, _ = run_egvs(*words, "--tilt", "2")
     assert (code, "passed" in printed) == (0, True)
+
+
+def test_folder_in_use_is_refused_before_anything_is_read(run_egvs: Any, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    with lock_run_folder(tmp_path):
+        code, printed, errors = run_egvs("accept", tmp_path, "--site", "a", "--scan", tmp_path / "no_scan.pcd")
+    assert (code, printed) == (2, "")
+    assert "another command is using this folder. Repeat egvs accept when it has ended" in errors
+
+
+def test_verdict_is_printed_though_a_command_began_meanwhile(
+    installed: InstalledRun, run_egvs: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(folder: Path, *_: object) -> None:
+        raise FolderInUseError(f"{folder}: another run is using this folder")
+
+    monkeypatch.setattr(acceptance_page, "add_to_report", refuse)
+    scan = installed.write("as_planned.ply", installed.points())
+    out = tmp_path / "out"
+    code, printed, errors = run_egvs("accept", installed.folder, "--site", "pole_a", "--scan", scan, "--out", out)
+    assert (code, "pole_a (wide): passed" in printed) == (2, True)
+    assert "its report lacks this verdict" in errors
+    assert (out / "acceptance_pole_a.json").is_file()
 
 
 def test_plan_and_command_have_the_same_default_limits() -> None:
@@ -391,7 +432,9 @@ def test_says_that_a_scan_was_levelled(tmp_path: Path) -> None:
     (tmp_path / "hung").mkdir()
     hung = write_street(tmp_path / "hung", kiosk, sites="pole_a,10,0,5,0,-5\n", mount="inverted")
     level = hung.points() @ rotation_world_sensor(0.0, -5.0, 180.0).T
-    with pytest.raises(InputError, match="at pitch 0 and roll 0: it was levelled"):
+    with pytest.raises(
+        InputError, match=r"it was levelled\. .* egvs clouds, .* back by pitch -5 and roll 180 degrees\."
+    ):
         accept_points(hung, level)
 
 

@@ -5,9 +5,9 @@ Steps: read the scans (sensor frame: x forward, y left, z up, metres); register 
 the empty scan that is expected from there (:mod:`egvs.extensions.hardware.installation.scan_comparison`); score the
 measured pose, and the sensor with its obstacles and missing channels; check each value against its limit.
 
-The tilt error is the angle between the planned and the measured z axis of the sensor. Errors of the pose are measured
-minus planned; those of angles are from -180 to 180 degrees. Standard errors cover the scatter of the returns about the
-static world, not an error of the whole map.
+The tilt error is the angle of the turn that is left when the error of the yaw, about the vertical, is taken out. Errors
+of the pose are measured minus planned; those of angles are from -180 to 180 degrees. Standard errors cover the scatter
+of the returns about the static world, not an error of the whole map.
 """
 
 from __future__ import annotations
@@ -80,7 +80,8 @@ class PoseError:
     position_m, position_se_m
         Distance of the positions.
     tilt_deg, tilt_se_deg
-        Angle between the z axes of the sensor. Standard errors are infinite if no surface fixes a part of the quantity.
+        Angle of the turn from the planned pose to the measured one with the planned yaw. Standard errors are infinite
+        if no surface fixes a part of the quantity.
     other_yaws_deg
         Measured minus planned yaw of the other poses at which the scans fit as well.
     """
@@ -123,9 +124,11 @@ def _distance_m(planned: Pose, pose: Pose) -> float:
 
 
 def _tilt_deg(planned: Pose, pose: Pose) -> float:
-    up = rotation_world_sensor(*planned.angles_deg)[:, 2]
-    measured_up = rotation_world_sensor(*pose.angles_deg)[:, 2]
-    return math.degrees(math.atan2(float(np.linalg.norm(np.cross(up, measured_up))), float(up @ measured_up)))
+    planned_tilt = rotation_world_sensor(0.0, planned.pitch_deg, planned.roll_deg)
+    tilt = rotation_world_sensor(0.0, pose.pitch_deg, pose.roll_deg)
+    # The norm of the difference of rotations by an angle is 2 sqrt(2) sin(angle / 2).
+    half_sine = float(np.linalg.norm(tilt - planned_tilt)) / math.sqrt(8.0)
+    return 2.0 * math.degrees(math.asin(min(half_sine, 1.0)))
 
 
 def _propagate(function: Callable[[Pose], float], fit: Registration) -> tuple[float, float]:
@@ -447,6 +450,8 @@ def _check_frame(
 ) -> None:
     """Raise an InputError that names the frame in which scans fit the static world, if one fits well."""
     own_frame = "Export it in the sensor's own frame: x forward, y left, z along its axis, right-handed."
+    turn_back = f"Turn points of egvs clouds, which are levelled, back by pitch {start.pitch_deg:g} and roll"
+    level_hint = f"{own_frame} {turn_back} {start.roll_deg:g} degrees."
     other_mount = "upright" if start.is_inverted else "inverted"
     level = rotation_world_sensor(0.0, start.pitch_deg, start.roll_deg)
     frames: list[tuple[FloatArray, str, str]] = [
@@ -459,7 +464,7 @@ def _check_frame(
         (np.diag([1.0, 1.0, -1.0]), "with z reversed", own_frame),
     ]
     if start.pitch_deg or start.roll_deg:
-        frames.append((level, "at pitch 0 and roll 0: it was levelled", own_frame))
+        frames.append((level, "at pitch 0 and roll 0: it was levelled", level_hint))
     if start.is_inverted:
         hung = rotation_world_sensor(0.0, start.pitch_deg, start.side_tilt_deg)
         frames.append((hung @ np.diag([1.0, -1.0, -1.0]), "levelled and the other way up", own_frame))

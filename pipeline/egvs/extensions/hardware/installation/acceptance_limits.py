@@ -17,7 +17,7 @@ class Limits:
     position_m
         Largest distance of the measured from the planned position.
     tilt_deg
-        Largest angle between the measured and the planned z axis of the sensor.
+        Largest angle of the turn that is left without the error of the yaw.
     yaw_deg
         Largest error of the yaw.
     blocked_deg

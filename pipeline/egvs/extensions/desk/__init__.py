@@ -1,0 +1,1 @@
+"""The planner's desk: from a map to a plan in the browser."""

@@ -1,0 +1,632 @@
+"""The open scenario: its files, what the page may change in them, and undo and redo.
+
+All state is in the files, which can also be edited by hand. A step of undo is the contents of the files before and
+after it. A change is checked as ``egvs check`` reads the files; if it is refused, nothing has changed.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import math
+import re
+import shutil
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+
+from egvs.artefacts.run_folder import RUNS, RunFolder
+from egvs.core import files, limits
+from egvs.core.errors import EgvsError, InputError
+from egvs.core.numbers import number_or_nan
+from egvs.extensions.desk import map_view, obstacles, results_view, traffic_view
+from egvs.extensions.desk.pole_check import PoleCheck, kerb_positions
+from egvs.extensions.desk.refusals import RefusalError, parse_number, require_text
+from egvs.scenario.loading import load
+from egvs.scenario.model import SCENARIO_FILE, Scenario
+from egvs.sensors import site_files, sites
+from egvs.sensors.sensor import CATALOGUE
+from egvs.stages.inputs import Inputs
+from egvs.world import geolocation
+
+Contents = dict[str, str]
+"""Text of each file of a scenario that the page may change, by name."""
+
+_EDITED = re.compile(r"[^/\\]+\.csv", re.IGNORECASE)
+_POSITION_COLUMNS = ("site", "x_m", "y_m")
+_OPTIONAL_NUMBERS = {"z_m": (-500.0, 10_000.0), "yaw_deg": (-360.0, 360.0), "pitch_deg": (-90.0, 90.0),
+                     "cost": (0.0, 1e9)}  # fmt: skip
+_SETTINGS = {
+    "frames": ("traffic", "frames"), "warmup_s": ("traffic", "warmup_s"), "seed": ("seed",),
+    "sensor": ("sites", "sensor"), "heights_m": ("sites", "heights_m"), "pitch_deg": ("sites", "pitch_deg"),
+    "pole_cost": ("costs", "pole"), "sensor_cost": ("costs", "sensor"),
+}  # fmt: skip
+_WHOLE = ("frames", "seed")
+_OF_MAP_NAME = re.compile(r"(lamp|signal|pole)\d+")
+
+
+@dataclass(frozen=True)
+class Step:
+    """A change: its name, and the contents of the files that it changed, before and after it."""
+
+    label: str
+    before: Contents
+    after: Contents
+
+
+@dataclass
+class CsvTable:
+    """A table in a CSV file, with its columns and rows in their order."""
+
+    columns: list[str]
+    rows: list[dict[str, str]]
+    delimiter: str = ","
+
+    @classmethod
+    def parse(cls, text: str) -> CsvTable:
+        """Return the table of a text."""
+        head = text.partition("\n")[0]
+        delimiter = ";" if head.count(";") > head.count(",") else ","
+        rows = [row for row in csv.reader(io.StringIO(text.removeprefix("\ufeff")), delimiter=delimiter) if any(row)]
+        columns = [name.strip() for name in rows[0]] if rows else []
+        return cls(columns, [dict(zip(columns, row, strict=False)) for row in rows[1:]], delimiter)
+
+    def to_text(self) -> str:
+        """Return the text; columns for the sensor that are empty everywhere are left out."""
+        optional = (*_OPTIONAL_NUMBERS, "sensor")
+        columns = [name for name in self.columns if name not in optional or any(row.get(name) for row in self.rows)]
+        text = io.StringIO()
+        writer = csv.writer(text, delimiter=self.delimiter, lineterminator="\n")
+        writer.writerows([columns, *([row.get(name, "") for name in columns] for row in self.rows)])
+        return text.getvalue()
+
+    def set(self, row: dict[str, str], column: str, value: str) -> None:
+        """Set a value; the column is added if there is none."""
+        if column not in self.columns and value:
+            self.columns.append(column)
+        row[column] = value
+
+
+@dataclass
+class _Scene:
+    """What is made of one version of the scenario's settings and map: slow to make, and kept while they stay."""
+
+    key: str
+    inputs: Inputs
+
+    @cached_property
+    def poles(self) -> PoleCheck:
+        return PoleCheck(self.inputs)
+
+    @cached_property
+    def view(self) -> dict[str, Any]:
+        return map_view.describe_scene(self.inputs)
+
+    @cached_property
+    def suggestions(self) -> list[dict[str, Any]]:
+        return kerb_positions(self.inputs)
+
+
+@dataclass
+class Project:
+    """A scenario in a folder.
+
+    Attributes
+    ----------
+    identifier
+        Its name in the workspace.
+    folder, run_folder
+        Folders of the scenario and of its run.
+    notes
+        What ``egvs new`` said about it.
+    """
+
+    identifier: str
+    folder: Path
+    run_folder: Path
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.lock = threading.RLock()
+        self._scene_lock = threading.Lock()  # taken after the other one, if both are
+        self._undo: list[Step] = []
+        self._redo: list[Step] = []
+        self._scenario = load(self.folder)
+        self._problem = ""
+        self._contents = self._read()
+        if SCENARIO_FILE not in self._contents:
+            raise RefusalError(409, f"{SCENARIO_FILE} is a link to another folder", "Open that folder.", "scenario")
+        self._kept_scene: _Scene | None = None
+        self._run_state: tuple[object, dict[str, Any]] = (None, {})
+
+    # ---- files
+
+    def _read(self) -> Contents:
+        """Return the present texts of the files."""
+        names = [SCENARIO_FILE, *self._table_names(), "signals.csv"]
+        contents = {}
+        for name in dict.fromkeys(names):
+            path = self.folder / name
+            if path.is_file() and path.resolve().parent == self.folder.resolve():
+                contents[name] = limits.read_bytes(path, limits.DOCUMENT).decode("utf-8", "replace")
+        return contents
+
+    def _table_names(self) -> list[str]:
+        named = [self._scenario.sites.file or "", self._counts_file()]
+        return [name for name in named if _EDITED.fullmatch(name)]
+
+    def _counts_file(self) -> str:
+        traffic = tomlkit.parse((self.folder / SCENARIO_FILE).read_text(encoding="utf-8")).unwrap().get("traffic", {})
+        name = traffic.get("counts") if isinstance(traffic, dict) else None
+        return name if isinstance(name, str) else ""
+
+    def refresh(self) -> bool:
+        """Take over what was edited by hand; return whether anything has changed."""
+        with self.lock:
+            try:
+                present = self._read()
+                if present == self._contents:
+                    return False
+                self._note_step("changes on disk", present)
+                scenario = load(self.folder)
+                sites.candidate_sites(scenario)
+                self._scenario, self._problem = scenario, ""
+            except (EgvsError, OSError, ValueError) as error:
+                changed, self._problem = str(error) != self._problem, str(error)
+                return changed
+            return True
+
+    def _note_step(self, label: str, after: Contents) -> None:
+        names = {name for name in {*self._contents, *after} if self._contents.get(name) != after.get(name)}
+        before = {name: self._contents.get(name, "") for name in names}
+        self._undo.append(Step(label, before, {name: after.get(name, "") for name in names}))
+        self._redo.clear()
+        self._contents = after
+
+    def _write(self, contents: Contents) -> None:
+        for name, text in contents.items():
+            files.write_text(self.folder / name, text)
+
+    def _change(self, label: str, after: Contents, field_name: str = "") -> None:
+        """Write files, and check that the scenario can be read; else write the former ones, and refuse."""
+        changed = {name: text for name, text in after.items() if self._contents.get(name) != text}
+        if not changed:
+            return
+        before = {name: self._contents[name] for name in changed}
+        try:
+            self._write(changed)
+            scenario = load(self.folder)
+            sites.candidate_sites(scenario)
+        except EgvsError as error:
+            self._write(before)
+            refusal = RefusalError.of(error, field_name)
+            refusal.content["message"] = refusal.content["message"].replace(f"{self.folder}/", "")
+            raise refusal from None
+        self._scenario, self._problem = scenario, ""
+        self._note_step(label, {**self._contents, **changed})
+
+    def step_back(self) -> None:
+        """Undo the last change."""
+        self._move(self._undo, self._redo, is_undo=True)
+
+    def step_forward(self) -> None:
+        """Do again what was undone last."""
+        self._move(self._redo, self._undo, is_undo=False)
+
+    def _move(self, source: list[Step], target: list[Step], *, is_undo: bool) -> None:
+        with self.lock:
+            self.refresh()
+            if not source:
+                raise RefusalError(409, f"There is nothing to {'undo' if is_undo else 'redo'}.")
+            step = source.pop()
+            self._write(step.before if is_undo else step.after)
+            target.append(step)
+            self._contents = self._read()
+            try:
+                scenario = load(self.folder)
+                sites.candidate_sites(scenario)
+                self._scenario, self._problem = scenario, ""
+            except EgvsError as error:  # the step was an edit by hand
+                self._problem = str(error)
+
+    # ---- poles
+
+    def check_pole(self, body: dict[str, Any]) -> str:
+        """Return why a pole cannot stand at a position; empty if it can."""
+        x_m, y_m = parse_number(body.get("x_m"), "x_m"), parse_number(body.get("y_m"), "y_m")
+        row = self._sites_table(editable=False)[1].get(str(body.get("site")), {})
+        config = self._scenario.sites
+        heights_m = [float(row["z_m"])] if row.get("z_m") else list(config.heights_m or (4.0,))
+        scene = self._scene()
+        with self._scene_lock:
+            return scene.poles.problem(
+                str(body.get("site", "")), x_m, y_m, heights_m, row.get("sensor") or config.sensor
+            )
+
+    def _refuse_impossible(self, body: dict[str, Any], field_name: str = "x_m") -> None:
+        if problem := self.check_pole(body):
+            raise RefusalError(422, problem, "", field_name)
+
+    def add_site(self, body: dict[str, Any]) -> str:
+        """Add a pole; return its name."""
+        with self.lock:
+            table, rows = self._sites_table()
+            name = str(body.get("site") or "").strip()
+            if not name:
+                name = next(f"new{number}" for number in range(1, len(rows) + 2) if f"new{number}" not in rows)
+            elif name in rows:
+                raise RefusalError(409, f"there is a pole {name!r}", "Choose another name.", "site")
+            self._refuse_impossible(body)
+            row = {"site": name}
+            table.rows.append(row)
+            self._fill(table, row, {key: value for key, value in body.items() if key not in ("site", *_FLAGS)})
+            self._change(f"add {name}", {**self._contents, self.sites_file: table.to_text()})
+            return name
+
+    def edit_site(self, name: str, body: dict[str, Any]) -> None:
+        """Change a pole: position, sensor, cost, its name, and whether it exists, must or must not be used."""
+        with self.lock:
+            table, rows = self._sites_table()
+            if name not in rows:
+                raise RefusalError(404, f"there is no pole {name!r}")
+            row, document = rows[name], tomlkit.parse(self._contents[SCENARIO_FILE])
+            is_moved = "x_m" in body or "y_m" in body
+            if is_moved:
+                position = {key: body.get(key, row[key]) for key in ("x_m", "y_m")}
+                self._refuse_impossible({**position, "site": name})
+                if row.get("moved_m"):  # somebody has said where it stands
+                    row["moved_m"] = ""
+            new_name = require_text(body, "site") if "site" in body else name
+            if new_name != name and new_name in rows:
+                raise RefusalError(409, f"there is a pole {new_name!r}", "Choose another name.", "site")
+            self._fill(table, row, {key: value for key, value in body.items() if key not in ("site", *_FLAGS)})
+            row["site"] = new_name
+            self._set_flags(document, name, new_name, body, row)
+            after = {**self._contents, self.sites_file: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
+            label = f"{'move' if is_moved and len(body) <= 2 else 'edit'} {name}"
+            self._change(label, after, "site" if new_name != name else next(iter(body), ""))
+
+    def remove_site(self, name: str) -> None:
+        """Remove a pole."""
+        with self.lock:
+            table, rows = self._sites_table()
+            if name not in rows:
+                raise RefusalError(404, f"there is no pole {name!r}")
+            table.rows.remove(rows[name])
+            document = tomlkit.parse(self._contents[SCENARIO_FILE])
+            self._set_flags(document, name, name, dict.fromkeys(_FLAGS, False), {})
+            after = {**self._contents, self.sites_file: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
+            self._change(f"remove {name}", after)
+
+    @property
+    def sites_file(self) -> str:
+        """Name of the table of poles."""
+        return self._scenario.sites.file or ""
+
+    @property
+    def digest(self) -> str:
+        """Changes with each change of the files."""
+        return hashlib.sha256(repr(sorted(self._contents.items())).encode()).hexdigest()
+
+    def copy_files(self, target: Path) -> None:
+        """Copy the scenario, as the results of its run belong to it, whatever is changed afterwards."""
+        shutil.rmtree(target, ignore_errors=True)
+        shutil.copytree(
+            self.folder, target, ignore=lambda folder, names: [str(RUNS)] if Path(folder) == self.folder else []
+        )
+
+    def _why_no_sites(self) -> str:
+        name = self._scenario.sites.file
+        if name is None:
+            return "The sites come from a rule of the scenario, not from a table."
+        if name not in self._contents:
+            return f"The sites are in {name}, which is no CSV file in the scenario's folder."
+        if not set(_POSITION_COLUMNS) <= set(CsvTable.parse(self._contents[name]).columns):
+            return f"{name} has no columns site, x_m and y_m."
+        return ""
+
+    def _sites_table(self, *, editable: bool = True) -> tuple[CsvTable, dict[str, dict[str, str]]]:
+        """Return the table of sites, and its rows by name."""
+        if editable:
+            self.refresh()
+            if reason := self._problem or self._why_no_sites():
+                raise RefusalError(409, reason)
+        table = CsvTable.parse(self._contents.get(self.sites_file, ""))
+        return table, {row.get("site", "").strip(): row for row in table.rows}
+
+    def _fill(self, table: CsvTable, row: dict[str, str], values: dict[str, Any]) -> None:
+        for key, value in values.items():
+            if key in ("x_m", "y_m"):
+                row[key] = repr(round(parse_number(value, key), 2))
+            elif key in _OPTIONAL_NUMBERS:
+                number = None if value in (None, "") else parse_number(value, key, *_OPTIONAL_NUMBERS[key])
+                table.set(row, key, "" if number is None else f"{number:.12g}")
+            elif key == "sensor":
+                if value not in (None, "", *self._sensor_names()):
+                    raise RefusalError(422, f"there is no sensor {value!r}", "", key)
+                table.set(row, key, value or "")
+            else:
+                raise RefusalError(422, f"{key[:40]!r} cannot be set for a pole", "", key[:40])
+
+    def _set_flags(self, document: Any, name: str, new_name: str, body: dict[str, Any], row: dict[str, str]) -> None:
+        """Set whether a pole exists, must or must not be used, and its name where these are listed."""
+        existing = self._scenario.sites.existing_poles
+        if existing == "all" and (body.get("exists") is False or new_name != name):
+            document["sites"]["existing_poles"] = list(self._sites_table(editable=False)[1])
+        for flag, (table, key) in _FLAGS.items():
+            listed = document.get(table, {}).get(key, [])
+            if isinstance(listed, str):  # all
+                continue
+            names = [str(each) for each in listed]
+            wanted = body.get(flag, name in names)
+            if not isinstance(wanted, bool):
+                raise RefusalError(422, f"expected true or false for {flag}", "", flag)
+            if flag == "must" and wanted and name not in names:
+                self._check_one_candidate(name, row)
+            others = [each for each in names if each != name]
+            if wanted:
+                position = names.index(name) if name in names else len(others)
+                others.insert(position, new_name)
+            if others != names:
+                document.setdefault(table, tomlkit.table())[key] = others
+
+    def _check_one_candidate(self, name: str, row: dict[str, str]) -> None:
+        """Refuse where a pole has several heights or tilts: a plan must know which one it is."""
+        config = self._scenario.sites
+        heights = 1 if row.get("z_m") else len(config.heights_m or (0.0,))
+        tilts = 1 if row.get("pitch_deg") or not isinstance(config.pitch_deg, tuple) else len(config.pitch_deg)
+        if heights * tilts > 1:
+            problem = f"{name} has {heights * tilts} candidates: heights and tilts"
+            raise RefusalError(422, problem, "Set its height and its tilt first.", "must")
+
+    # ---- counts and settings
+
+    def set_counts(self, body: dict[str, Any]) -> None:
+        """Set vehicles per hour of some movements, by their position in the table."""
+        with self.lock:
+            self.refresh()
+            if reason := self._problem or self._why_no_counts():
+                raise RefusalError(409, reason)
+            name = self._counts_file()
+            table, counts = CsvTable.parse(self._contents[name]), body.get("counts")
+            if not isinstance(counts, dict):
+                raise RefusalError(422, "expected counts by their index", "", "counts")
+            for index, value in counts.items():
+                if not index.isdecimal() or int(index) >= len(table.rows):
+                    raise RefusalError(404, f"there is no movement {index[:20]!r}", "", index[:20])
+                number = parse_number(value, index, 0.0, 1e5)
+                table.rows[int(index)]["count"] = f"{number:.12g}"
+            self._change("counts", {**self._contents, name: table.to_text()})
+
+    def _why_no_counts(self) -> str:
+        if self._scenario.traffic.periods:
+            return "The counts are those of several periods; edit them in the files."
+        name = self._counts_file()
+        if name not in self._contents:
+            return "The scenario has no table of counts."
+        return ""
+
+    def set_signals(self, body: dict[str, Any]) -> None:
+        """Set green times of a signal in its table, and its yellow and all-red, which are those of all phases."""
+        with self.lock:
+            self.refresh()
+            known = {signal["name"]: signal for signal in self._describe_signals()}
+            signal = known.get(str(body.get("name")))
+            phases = body.get("phases")
+            if signal is None or not signal["editable"]:
+                raise RefusalError(409, self._problem or (signal or {}).get("reason") or "there is no such signal")
+            if not isinstance(phases, list) or len(phases) != len(signal["phases"]):
+                raise RefusalError(422, f"expected {len(signal['phases'])} phases", "", "phases")
+            document = tomlkit.parse(self._contents[SCENARIO_FILE])
+            plan: Any = document["traffic"]["signals"][signal["name"]]
+            table = CsvTable.parse(self._contents[signal["file"]])
+            for number, (given, present) in enumerate(zip(phases, signal["phases"], strict=True)):
+                for key in ("green_s", "yellow_s", "all_red_s"):
+                    value = parse_number(
+                        given.get(key), f"phases.{number}.{key}", 1.0 if key == "green_s" else 0.0, 300.0
+                    )
+                    if key == "green_s":
+                        for row in table.rows:
+                            if row.get("phase") == present["name"]:
+                                row[key] = f"{value:.12g}"
+                    elif value != present[key]:
+                        plan[key] = value
+            after = {**self._contents, signal["file"]: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
+            self._change("signals", after, "phases")
+
+    def _describe_signals(self) -> list[dict[str, Any]]:
+        movements = traffic_view.describe_movements(self._scenario, self._scene().inputs.network)["movements"]
+        tables = {name: CsvTable.parse(text).rows for name, text in self._contents.items() if name.endswith(".csv")}
+        return traffic_view.describe_signals(self._scenario, movements, tables)
+
+    @property
+    def obstacles(self) -> list[dict[str, Any]]:
+        """What could stand in the way."""
+        return obstacles.describe_obstacles(self._scenario)
+
+    def set_obstacles(self, body: dict[str, Any]) -> None:
+        """Set what could stand in the way, for ``egvs what-if``."""
+        with self.lock:
+            self.refresh()
+            document = tomlkit.parse(self._contents[SCENARIO_FILE])
+            obstacles.write_obstacles(document, body.get("obstacles"))
+            self._change("obstacles", {**self._contents, SCENARIO_FILE: tomlkit.dumps(document)}, "obstacles")
+
+    def set_settings(self, body: dict[str, Any]) -> None:
+        """Set keys of the scenario."""
+        with self.lock:
+            self.refresh()
+            document = tomlkit.parse(self._contents[SCENARIO_FILE])
+            for key, value in body.items():
+                if key not in _SETTINGS:
+                    raise RefusalError(422, f"{key[:40]!r} cannot be set here", "", key[:40])
+                *tables, last = _SETTINGS[key]
+                table: Any = document
+                for name in tables:
+                    table = table.setdefault(name, tomlkit.table())
+                table[last] = self._setting(key, value)
+            self._change("settings", {**self._contents, SCENARIO_FILE: tomlkit.dumps(document)})
+
+    def _setting(self, key: str, value: Any) -> Any:
+        if key == "sensor":
+            if value not in self._sensor_names():
+                raise RefusalError(422, f"there is no sensor {str(value)[:40]!r}", "", key)
+            return value
+        if key in ("heights_m", "pitch_deg"):
+            values = value if isinstance(value, list) else [value]
+            return ["aim" if each == "aim" and key == "pitch_deg" else parse_number(each, key) for each in values]
+        number = parse_number(value, key, 0.0)
+        if key in _WHOLE:
+            if number != int(number):
+                raise RefusalError(422, f"expected a whole number, got {value!r}", "", key)
+            return int(number)
+        return {self._scenario.sites.sensor: number} if key == "sensor_cost" else number
+
+    def _sensor_names(self) -> list[str]:
+        return [*self._scenario.sensors, *CATALOGUE]
+
+    # ---- what the page shows
+
+    def _scene(self) -> _Scene:
+        scenario = self._scenario
+        texts = [self._contents[SCENARIO_FILE]]
+        stamps = [
+            (path.name, status.st_size, status.st_mtime_ns)
+            for path in sorted(self.folder.iterdir())
+            if path.is_file() and path.name not in self._contents and (status := path.stat())
+        ]
+        key = hashlib.sha256(repr((texts, stamps)).encode()).hexdigest()[:16]
+        with self.lock:
+            if self._kept_scene is None or self._kept_scene.key != key:
+                self._kept_scene = _Scene(key, Inputs(scenario))
+            return self._kept_scene
+
+    def map(self) -> dict[str, Any]:
+        """Return the map for the page."""
+        scene = self._scene()
+        with self._scene_lock:
+            return _refused(lambda: {"key": scene.key, **scene.view})
+
+    def suggestions(self) -> dict[str, Any]:
+        """Return free positions along the kerbs."""
+        scene = self._scene()
+        with self._scene_lock:
+            return _refused(lambda: {"poles": scene.suggestions})
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario as it is now."""
+        return self._scenario
+
+    def run_state(self) -> dict[str, Any]:
+        """Return the state of the run, with the present files."""
+        record = RunFolder(self.run_folder)
+        stamps = [path.stat().st_mtime_ns for path in (record.run_record, record.placement) if path.is_file()]
+        key = (stamps, dict(self._contents))
+        if self._run_state[0] != key:
+            self._run_state = key, results_view.describe_run(self.run_folder, self._scenario)
+        return self._run_state[1]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the state for the page."""
+        with self.lock:
+            self.refresh()
+            scenario, config = self._scenario, self._scenario.sites
+            scene = self._scene()
+            try:
+                traffic = traffic_view.describe_movements(scenario, scene.inputs.network)
+                traffic["signals"] = self._describe_signals()
+                origin = self._origin()
+            except EgvsError as error:
+                traffic, origin = {**traffic_view.describe_movements(scenario, None), "signals": []}, None
+                self._problem = self._problem or str(error)
+            settings = scenario.traffic
+            return {
+                "id": self.identifier, "name": scenario.name, "title": scenario.description or scenario.name,
+                "assumed": list(scenario.assumed), "notes": self.notes, "problem": self._problem,
+                "files": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in self._contents.items()},
+                "roi": {"center_m": scenario.roi.center_m, "size_m": scenario.roi.size_m}, "origin": origin,
+                "map_key": scene.key,
+                "mounts": {
+                    "sensor": config.sensor, "heights_m": list(config.heights_m or ()), "aim": config.aim,
+                    "pitch_deg": list(config.pitch_deg) if isinstance(config.pitch_deg, tuple) else [config.pitch_deg],
+                },
+                "sensors": self._sensor_names(),
+                "sites_editable": not self._why_no_sites(), "sites_reason": self._why_no_sites(),
+                "sites": self._describe_sites(),
+                **traffic, "obstacles": self.obstacles,
+                "counts_editable": not self._why_no_counts(), "counts_reason": self._why_no_counts(),
+                "settings": {
+                    "frames": settings.frames, "frame_period_s": settings.frame_period_s,
+                    "warmup_s": settings.warmup_s, "seed": scenario.seed,
+                    "traffic_s": None if settings.frames is None else settings.frames * settings.frame_period_s,
+                },
+                "costs": {
+                    "are_given": scenario.costs.are_given, "pole_cost": scenario.costs.pole,
+                    "sensor_cost": scenario.costs.sensor.get(config.sensor),
+                },
+                "run": {"id": self.run_folder.name, **self.run_state()},
+                "undo": self._undo[-1].label if self._undo else None,
+                "redo": self._redo[-1].label if self._redo else None,
+            }  # fmt: skip
+
+    def _origin(self) -> dict[str, float] | None:
+        frame = geolocation.scenario_georeference(self._scenario).frame
+        if frame is None:
+            return None
+        ((lon_deg, lat_deg),) = frame.to_degrees(np.array([self._scenario.roi.center_m[:2]])).tolist()
+        return {"lat_deg": lat_deg, "lon_deg": lon_deg}
+
+    def _describe_sites(self) -> list[dict[str, Any]]:
+        placement, existing = self._scenario.placement, self._scenario.sites.existing_poles
+        described = []
+        for row in self._site_rows():
+            name, source = str(row["site"]), str(row.get("source") or "")
+            numbers = {key: _number_or_none(row.get(key)) for key in (*_OPTIONAL_NUMBERS, "moved_m")}
+            described.append({
+                "site": name, "x_m": float(row["x_m"]), "y_m": float(row["y_m"]), "source": source, **numbers,
+                "sensor": row.get("sensor") or None, "moved_m": numbers["moved_m"] or 0.0,
+                "kind": name.rstrip("0123456789") if source and _OF_MAP_NAME.fullmatch(name) else "",
+                "exists": sites.pole_exists(name, existing),
+                "must": name in placement.forced, "must_not": name in placement.excluded,
+            })  # fmt: skip
+        return described
+
+    def _site_rows(self) -> list[dict[str, Any]]:
+        """Return the rows of the table, else the poles of the scenario; empty where they cannot be read."""
+        try:
+            if not self._why_no_sites():
+                world = geolocation.scenario_georeference(self._scenario)
+                return [row.columns for row in site_files.read_table(self.folder / self.sites_file, world)[0]]
+            poles = {each.pole: each for each in sites.candidate_sites(self._scenario)}
+        except InputError as error:
+            self._problem = self._problem or str(error)
+            return []
+        return [{"site": name, "x_m": each.pose.x_m, "y_m": each.pose.y_m} for name, each in poles.items()]
+
+
+def _number_or_none(value: Any) -> float | None:
+    number = number_or_nan(str(value))
+    return number if math.isfinite(number) else None
+
+
+_FLAGS = {
+    "exists": ("sites", "existing_poles"),
+    "must": ("placement", "forced"),
+    "must_not": ("placement", "excluded"),
+}
+"""Keys of the scenario that list poles, by what the page calls them."""
+
+
+def _refused(make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    try:
+        return make()
+    except EgvsError as error:
+        raise RefusalError.of(error) from None

@@ -1,0 +1,116 @@
+"""Ranking, plan and state of a run, as the page shows them: the numbers and the texts of the report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.artefacts.run_record import RunRecord
+from egvs.core.errors import InputError
+from egvs.core.wording import format_percent
+from egvs.results.labels import ScoreLabel
+from egvs.results.plans import SensorPlan
+from egvs.results.ranking import RankedSite, Ranking, describe_mount
+from egvs.runs import run_sources
+from egvs.scenario.model import Scenario
+from egvs.scenario.score_config import PlacementConfig
+
+_NO_SCORES = ("placement", "costs", "what_if")
+"""Beginnings of the keys of settings on which no score depends."""
+
+
+def describe_run(folder: Path, scenario: Scenario) -> dict[str, Any]:
+    """Return the state of the run of a scenario: none, partial, complete or outdated."""
+    state: dict[str, Any] = {"state": "none", "missing": [], "changed": [], "has_plan": False, "plan_outdated": False}
+    if not RunFolder(folder).has_record:
+        return state
+    try:
+        record = RunRecord.read(folder)
+        state["missing"] = [name for name in STAGE_NAMES if name not in record.stages]
+        recorded = run_sources.recorded_scenario(folder)
+        settings = run_sources.compared_settings(recorded, scenario)
+        changed = [key for key in settings if not key.startswith(_NO_SCORES)]
+        changed += run_sources.changed_files(folder, recorded)
+        plan = SensorPlan.read(RunFolder(folder))
+    except InputError as error:
+        return {**state, "state": "partial", "changed": [error.problem]}
+    state["changed"] = changed
+    state["state"] = "partial" if "score" in state["missing"] else "outdated" if changed else "complete"
+    state["has_plan"] = plan is not None
+    state["plan_outdated"] = plan is not None and (
+        bool(changed) or not plan.belongs_to(record.stages) or _placement_rules(plan.request) != _placement_rules(
+            scenario.placement.model_dump(mode="json")
+        )
+    )  # fmt: skip
+    return state
+
+
+def _placement_rules(placement: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a plan must meet, without the request for one."""
+    config = PlacementConfig.model_validate({**placement, **dict.fromkeys(("count", "budget", "reach"))})
+    return config.model_dump(exclude={"refine"})
+
+
+def describe_ranking(folder: Path) -> dict[str, Any]:
+    """Return the ranking of a run."""
+    ranking = Ranking.read(RunFolder(folder).scores)
+    by = ranking.by
+    sites = [_describe_site(site, by) for site in ranking.sites]
+    poles = []
+    for rank, pole in enumerate(ranking.poles, start=1):
+        best = _describe_site(pole.best, by)
+        behind = by.change(pole.best.score - ranking.sites[0].score) + f" {by.change_unit}" if rank > 1 else ""
+        poles.append({**best, "pole": pole.name, "rank": rank, "mount_text": describe_mount(pole.best),
+                      "behind_text": behind})  # fmt: skip
+    return {"rank_by": by.name, "label": by.head, "unit": "%" if by.is_share else by.unit, "poles": poles,
+            "sites": sites}  # fmt: skip
+
+
+def _describe_site(site: RankedSite, by: ScoreLabel) -> dict[str, Any]:
+    se = math.nan if site.score_se is None else site.score_se
+    return {
+        "rank": site.rank, "site": site.site, "pole": site.pole, "x_m": site.x_m, "y_m": site.y_m, "z_m": site.z_m,
+        "yaw_deg": site.yaw_deg, "pitch_deg": site.pitch_deg, "sensor": site.sensor, "score": _finite(site.score),
+        "score_se": site.score_se, "score_text": by.with_unit(site.score, se), "egvs": _finite(site.egvs),
+        "entropy_seen": _finite(site.entropy_seen),
+    }  # fmt: skip
+
+
+def describe_plan(folder: Path) -> dict[str, Any] | None:
+    """Return the plan of a run; None if there is none."""
+    plan = SensorPlan.read(RunFolder(folder))
+    if plan is None:
+        return None
+    by = plan.by
+    sensors = [
+        {
+            "order": each.order, "site": each.site, "pole": each.pole, "x_m": each.x_m, "y_m": each.y_m,
+            "z_m": each.z_m, "yaw_deg": each.yaw_deg, "pitch_deg": each.pitch_deg, "sensor": each.sensor,
+            "gain_text": by.change(each.gain, each.gain_se), "score_text": by.with_unit(each.score, each.score_se),
+            "loss_text": by.change(each.loss), "cost": each.cost, "forced": each.forced,
+        }
+        for each in plan.sensors
+    ]  # fmt: skip
+    curve = [
+        {
+            "count": step.count, "score": _finite(step.score), "score_text": by.with_unit(step.score, step.score_se),
+            "sites": list(step.sites), "cost": step.cost, "certificate": _finite(step.certificate),
+        }
+        for step in plan.curve
+    ]  # fmt: skip
+    proof = "proved to be the best plan" if plan.is_best else (
+        f"at least {format_percent(math.floor(plan.certificate * 1000) / 1000)} of the best possible score, proved"
+    )  # fmt: skip
+    return {
+        "requested": {key: plan.request[key] for key in ("count", "budget", "reach") if plan.request.get(key)},
+        "label": by.head, "unit": "%" if by.is_share else by.unit, "change_unit": by.change_unit, "sensors": sensors,
+        "curve": curve, "score_text": by.with_unit(plan.joint, plan.joint_se), "cost": plan.cost,
+        "certificate": _finite(plan.certificate), "certificate_text": proof, "is_best": plan.is_best,
+    }  # fmt: skip
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,103 @@
+"""The counts of a scenario as movements of a diagram: names, numbers, and where their arrows begin and end."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from egvs.core.numbers import number_or_nan
+from egvs.scenario.model import Scenario
+from egvs.scenario.signal_config import ASSUMED_PLANS
+from egvs.traffic import capacity
+from egvs.traffic.approach_names import approach_name
+from egvs.traffic.directions import arrival_side
+from egvs.traffic.movements import MovementNames
+from egvs.traffic.network import CAR, Edge, Network
+
+
+def describe_movements(scenario: Scenario, network: Network | None) -> dict[str, Any]:
+    """Return movements and approaches of the counts, in the order of the counts; empty without a network."""
+    counts = scenario.traffic.counts
+    if network is None or not counts:
+        return {"movements": [], "approaches": [], "counts_total_per_h": 0}
+    x_m, y_m, _ = scenario.roi.center_m
+    names = MovementNames(network, (x_m, y_m), counts)
+    edges = {edge.id: edge for edge in network.edges}
+    problems = {
+        place: f"{per_h:,.0f} vehicles an hour exceed what {lanes} lanes can carry, {lanes * capacity.LANE_PER_H:,.0f}"
+        for place, per_h, lanes in capacity.find_excess(network, names, counts)
+    }
+    is_assumed = any(text.startswith("traffic") for text in scenario.assumed)
+    movements = []
+    approaches: dict[str, dict[str, Any]] = {}
+    for index, count in enumerate(counts):
+        movement = names.movement(count.edge or count.from_edge or "", count.to_edge)
+        edge = movement.approach[-1]
+        approach = approach_name(arrival_side(movement.heading), movement.street) or "junction"
+        way_out = None if count.to_edge is None else edges[count.to_edge]
+        movements.append({
+            "index": index, "approach": approach, "turn": movement.turn, "to": movement.way_out,
+            "count_per_h": count.per_hour, "from_m": _nearest_point(edge, x_m, y_m), "via_m": [x_m, y_m],
+            "assumed": is_assumed, "kind": count.kind,
+            "to_m": None if way_out is None else _nearest_point(way_out, x_m, y_m),
+            "problem": problems.get(f"{approach} {movement.turn}".strip(), ""),
+        })  # fmt: skip
+        lanes = edge.lanes_for(CAR)
+        row = approaches.setdefault(approach, {
+            "approach": approach, "at_m": movements[-1]["from_m"], "in_per_h": 0.0, "lanes": lanes,
+            "limit_per_h": lanes * capacity.LANE_PER_H, "problem": problems.get(approach, ""),
+        })  # fmt: skip
+        row["in_per_h"] += count.per_hour
+    total = sum(count.per_hour for count in counts)
+    return {"movements": movements, "approaches": list(approaches.values()), "counts_total_per_h": total}
+
+
+def _nearest_point(edge: Edge, x_m: float, y_m: float) -> list[float]:
+    """Return the point of the middle line of an edge that is nearest to a point."""
+    lanes = [lane.shape_m[:, :2] for lane in edge.lanes if lane.permission.admits(CAR)] or [edge.lanes[0].shape_m]
+    ends_m = np.array([[lane[0, :2], lane[-1, :2]] for lane in lanes]).mean(axis=0)
+    distance_m = np.hypot(*(ends_m - (x_m, y_m)).T)
+    return [round(value, 2) for value in ends_m[distance_m.argmin()].tolist()]
+
+
+def describe_signals(
+    scenario: Scenario, movements: list[dict[str, Any]], tables: dict[str, list[dict[str, str]]]
+) -> list[dict[str, Any]]:
+    """Return the plans of signals that are in tables.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    movements
+        From :func:`describe_movements`.
+    tables
+        The rows of each table of the scenario, by its file name.
+    """
+    described = []
+    title = scenario.description if len(scenario.traffic.signals) == 1 else ""
+    for name, plan in scenario.traffic.signals.items():
+        rows = tables.get(plan.file or "", [])
+        phases: dict[str, dict[str, Any]] = {}
+        for row in rows:
+            phase = phases.setdefault(row.get("phase", ""), {
+                "name": row.get("phase", ""), "green_s": number_or_nan(row.get("green_s", "")),
+                "yellow_s": plan.yellow_s, "all_red_s": plan.all_red_s, "green": [],
+            })  # fmt: skip
+            turns = row.get("movement", "").split()
+            phase["green"] += [
+                movement["index"]
+                for movement in movements
+                if movement["approach"] == row.get("approach") and (movement["turn"] in turns or "all" in turns)
+            ]
+        cycle_s = sum(phase["green_s"] + plan.yellow_s + plan.all_red_s for phase in phases.values())
+        if not math.isfinite(cycle_s) or not phases:
+            continue
+        described.append({
+            "name": name, "title": title or name, "file": plan.file, "assumed": ASSUMED_PLANS in scenario.assumed,
+            "editable": True, "reason": "", "offset_s": plan.offset_s, "cycle_s": cycle_s,
+            "phases": list(phases.values()),
+        })  # fmt: skip
+    return described

@@ -1,0 +1,221 @@
+"""The program of a job: calls what the command line calls, in a process of its own that can be stopped.
+
+``python -m egvs.extensions.desk.worker`` reads one line with a request in JSON from standard input, and writes lines
+in JSON to standard output: ``progress`` (stage, what, done, total), and at the end ``result``, or ``error`` and
+``hint``. What commands print goes to standard error. It ends when its standard input is closed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from egvs.core.errors import EgvsError
+from egvs.extensions.desk.refusals import describe_error
+
+_INTERVAL_S = 0.15
+Send = Callable[[dict[str, Any]], None]
+
+
+class Progress:
+    """Sends how far a job is, a few times a second."""
+
+    def __init__(self, send: Send) -> None:
+        self.stage = ""
+        self._send, self._last = send, ("", "", 0.0)
+
+    def report(self, what: str, done: int, total: int) -> None:
+        """Send progress; a :data:`egvs.core.progress.ProgressCallback`."""
+        now_s = time.monotonic()
+        stage, last_what, last_s = self._last
+        if (stage, last_what) == (self.stage, what) and now_s - last_s < _INTERVAL_S:
+            return
+        self._last = self.stage, what, now_s
+        self._send({"progress": [self.stage, what, done, total]})
+
+    def stage_event(self, stage: str, state: str, _record: object) -> None:
+        """Note which stage runs; a :data:`egvs.runs.run.StageListener`."""
+        if state == "runs":
+            self.stage = stage
+            self.report("", 0, 0)
+
+
+def list_junctions(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Read the streets of a map, and write them for the page to the file ``out``."""
+    from egvs.core import files
+    from egvs.creation.new_scenario import read_map_streets
+    from egvs.extensions.desk.map_view import describe_streets
+
+    streets = read_map_streets([request["map"]], progress=progress.report)
+    files.write_text(Path(request["out"]), json.dumps(describe_streets(streets)))
+    return {}
+
+
+def download_map(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Download the map around a point, as ``egvs new --download``, and copy it to the file ``out``."""
+    from egvs.creation.openstreetmap import overpass
+
+    progress.report("downloads the map", 0, 0)
+    extract = overpass.download_extract((request["at"][0], request["at"][1]))
+    shutil.copyfile(extract.path, request["out"])
+    return {"note": extract.note}
+
+
+def create(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Make a scenario, as ``egvs new``."""
+    from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
+
+    progress.report("makes the scenario", 0, 0)
+    options = NewScenarioOptions(
+        existing_poles=request["poles"] == "existing", traffic=request["traffic"], walk=request["walk"]
+    )
+    at = request["at"]
+    made = create_scenario(request["folder"], request["map"], None if at is None else (at[0], at[1]), options)
+    return {"notes": list(made.notes)}
+
+
+def run_stages(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Run a scenario, and print the answer, as ``egvs run``."""
+    from egvs.cli import answer
+    from egvs.cli.console import ProgressDisplay
+    from egvs.runs.run import run
+    from egvs.scenario.loading import load
+
+    folder = Path(request["run"])
+    with ProgressDisplay("run", is_run=True) as screen:
+
+        def listen(stage: str, state: str, record: Any) -> None:
+            progress.stage_event(stage, state, record)
+            screen.stage_event(stage, state, record)
+
+        scenario = load(request["scenario"])
+        screen.flow_source = answer.flow_source(scenario)
+        record = run(scenario, folder, progress=progress.report, listener=listen)
+    answer.print_answer(folder, scenario, record, lines_before=screen.warning_lines)
+    return {}
+
+
+def plan(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Plan several sensors, as ``egvs place``."""
+    from egvs.placement.plan import place
+    from egvs.runs.run_sources import SettingsSource
+
+    scenario = SettingsSource.of(Path(request["scenario"])).load_with_request(request["request"])
+    place(scenario, request["run"], progress=progress.report, listener=progress.stage_event)
+    return {}
+
+
+def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Compare the ranking with that with obstacles, as ``egvs what-if``."""
+    from egvs.results.sensors import difference_unit, format_difference
+    from egvs.studies.what_if import what_if
+
+    result = what_if(
+        request["scenario"], names=[request["table"]], progress=progress.report, listener=progress.stage_event
+    )
+    (answer,) = result.answers
+    rows = []
+    for site in result.sites:
+        after = site.present[0]
+        row = {"pole": site.site, "before_text": result.label.with_unit(site.before), "after_text": "impossible"}
+        row["change_text"] = ""
+        if after is not None:
+            row["after_text"] = result.label.with_unit(after)
+            row["change_text"] = f"{result.label.change(after - site.before)} {result.label.change_unit}"
+        if site.site == result.best.site and answer.change is not None:
+            row["change_text"] = f"{format_difference(answer.change, result.best)} {difference_unit(result.best)}"
+        rows.append(row)
+    return {"text": [answer.conclusion(), *result.notes], "poles": rows}
+
+
+def run_command(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Run a command of the command line."""
+    from egvs.cli.app import app
+
+    progress.report("writes", 0, 0)
+    app(args=request["words"], standalone_mode=False)
+    return {}
+
+
+def rate_poses(send: Send, request: dict[str, Any]) -> dict[str, Any]:
+    """Score one pose after another, as the explorer: each line of standard input is a request."""
+    from dataclasses import replace
+
+    from egvs.explore.session import Session
+    from egvs.explore.settings import open_session
+    from egvs.results.labels import SCORE_LABELS
+
+    session: Session = open_session(request["scenario"], out=request["run"])
+    label = SCORE_LABELS[session.rank_by]
+    send({"ready": True})
+    for line in sys.stdin:
+        wanted = json.loads(line)
+        answer: dict[str, Any] = {"request": wanted.get("request"), "site": wanted["site"], "ok": False, "message": ""}
+        try:
+            candidate = session.candidates[wanted["site"]].site
+            rated = session.rate(candidate.name, replace(candidate.pose, **wanted["pose"]))
+            if rated.is_feasible:
+                score = rated.scores[session.rank_by]
+                answer |= {"ok": True, "score": score, "score_text": label.with_unit(score), "rank": rated.rank}
+            else:
+                answer["message"] = "; ".join(finding.problem for finding in rated.findings if finding.is_error)
+        except KeyError:
+            answer["message"] = f"the run has no candidate {wanted['site']}"
+        except EgvsError as error:
+            answer["message"] = describe_error(error)[0]
+        send({"score": answer})
+    return {}
+
+
+JOBS: dict[str, Callable[[Progress, dict[str, Any]], dict[str, Any]]] = {
+    "junctions": list_junctions, "download": download_map, "new": create, "run": run_stages, "plan": plan,
+    "what_if": evaluate_obstacles, "export": run_command,
+}  # fmt: skip
+"""What each kind of job calls."""
+
+
+def _end_with_input() -> None:
+    """Interrupt this program when its standard input is closed."""
+    sys.stdin.read()
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def main() -> int:
+    """Do one job; return the exit code."""
+    channel = os.fdopen(os.dup(1), "w", encoding="utf-8", buffering=1)
+    os.dup2(2, 1)
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+
+    def send(message: dict[str, Any]) -> None:
+        channel.write(json.dumps(message) + "\n")
+
+    try:
+        request = json.loads(sys.stdin.readline())
+        if request["kind"] == "live":
+            result = rate_poses(send, request)
+        else:
+            threading.Thread(target=_end_with_input, daemon=True).start()
+            result = JOBS[request["kind"]](Progress(send), request)
+    except EgvsError as error:
+        message, hint = describe_error(error)
+        send({"error": message, "hint": hint})
+        return error.exit_code
+    except (OSError, MemoryError) as error:
+        send({"error": str(error) or "not enough memory", "hint": ""})
+        return EgvsError.exit_code
+    except KeyboardInterrupt:
+        return 130
+    send({"result": result})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,42 @@
+"""A served folder with a scenario that needs no simulation, and one with a junction made from a map."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
+from tests.conftest import write_mini
+from tests.extensions.desk.serving import Client, serving
+
+MAP = Path(__file__).parents[2] / "creation" / "data" / "small.osm"
+"""A made-up town with a signal mast, two lamps and a junction with signals."""
+
+
+@pytest.fixture(scope="session")
+def made_town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scenario from the map, with existing poles."""
+    folder = tmp_path_factory.mktemp("made") / "town"
+    create_scenario(folder, MAP, options=NewScenarioOptions(existing_poles=True))
+    return folder
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Client]:
+    """A page over a folder with the scenario ``mini``."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    write_mini(folder / "mini")
+    with serving(folder, tmp_path / "scratch") as client:
+        yield client
+
+
+@pytest.fixture
+def town(desk: Client, made_town: Path, tmp_path: Path) -> Client:
+    """The page with the town open."""
+    shutil.copytree(made_town, tmp_path / "work" / "town")
+    desk.ok("POST", "/api/open", {"scenario": "town"})
+    return desk

@@ -1,0 +1,183 @@
+"""From a map to a plan by the calls of the page; the command line gives the same ranking, byte for byte."""
+
+from __future__ import annotations
+
+import http.client
+import io
+import json
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.extensions.desk.conftest import MAP
+from tests.extensions.desk.serving import Client
+
+pytestmark = [pytest.mark.system, pytest.mark.slow]
+
+
+@contextmanager
+def listening(desk: Client) -> Iterator[http.client.HTTPResponse]:
+    """Receive events."""
+    connection = http.client.HTTPConnection(desk.host, timeout=120)
+    connection.request("GET", "/api/events", headers={"Cookie": desk.cookie})
+    response = connection.getresponse()
+    try:
+        yield response
+    finally:
+        connection.close()
+
+
+def next_event(events: http.client.HTTPResponse, name: str) -> dict[str, object]:
+    while True:
+        if events.readline().decode().strip() == f"event: {name}":
+            content: dict[str, object] = json.loads(events.readline().removeprefix(b"data: "))
+            return content
+
+
+def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:
+    dropped = desk.ok("POST", "/api/maps?name=town.osm", MAP.read_bytes())
+    desk.ok("POST", f"/api/maps/{dropped['id']}/read", {})
+    desk.wait()
+    streets = desk.ok("GET", f"/api/maps/{dropped['id']}")["streets"]
+    junction = streets["junctions"][0]
+    assert (junction["title"], junction["arms"]) == ("signalised junction of East Street and North Street", 4)
+    request = {"map": dropped["id"], "name": "town", "at": junction["at"], "poles": "existing"}
+    desk.ok("POST", "/api/new", request)
+    assert desk.wait()["result"]["notes"]
+    assert desk.refused("POST", "/api/new", request)[::2] == (409, "name")
+
+    desk.ok("POST", "/api/sites", {"x_m": "211,5", "y_m": 211})
+    desk.ok("PUT", "/api/counts", {"counts": {"0": 300, "7": "280"}})
+    desk.ok("PUT", "/api/settings", {"frames": 60, "warmup_s": 20, "heights_m": [4, 6], "pitch_deg": [-5]})
+    desk.ok("POST", "/api/run", {})
+    job = desk.wait()
+    assert any(line.startswith("score") for line in job["log"] if line) or job["state"] == "done"
+
+    ranking = desk.ok("GET", "/api/ranking")
+    assert sorted(pole["pole"] for pole in ranking["poles"]) == ["lamp1", "new1", "signal1"]
+    assert not ranking["outdated"]
+    command = [sys.executable, "-m", "egvs", "run", "town", "--out", str(tmp_path / "again")]
+    subprocess.run(command, cwd=tmp_path / "work", check=True, capture_output=True)
+    scores = [folder / "scores.parquet" for folder in (tmp_path / "work" / "runs" / "town", tmp_path / "again")]
+    assert scores[0].read_bytes() == scores[1].read_bytes()
+
+    desk.ok("POST", "/api/plan", {"count": "2"})
+    desk.wait()
+    plan = desk.ok("GET", "/api/plan")
+    assert (len(plan["sensors"]), plan["requested"]) == (2, {"count": 2})
+    assert 0.9 < plan["certificate"] <= 1
+    desk.ok("POST", "/api/plan", {"count": 99})
+    assert "at most" in desk.wait("failed")["message"]
+
+    for name, begin in (("gpkg", b"SQLite"), ("sheets", b"PK"), ("csv", b"PK")):
+        desk.ok("POST", f"/api/downloads/{name}", {})
+        url = desk.wait()["result"]["url"]
+        _, headers, content = desk.raw("GET", url)
+        assert content.startswith(begin)
+        assert headers["content-disposition"].startswith("attachment")
+    _, _, packed = desk.raw("GET", "/api/files/scenario")
+    assert {"scenario.toml", "sites.csv", "counts.csv"} <= set(zipfile.ZipFile(io.BytesIO(packed)).namelist())
+    assert desk.ok("POST", "/api/import?name=sent.zip", packed)["project"]["id"] == "sent"
+    assert (tmp_path / "work" / "sent" / "sites.csv").read_bytes() == (
+        tmp_path / "work" / "town" / "sites.csv"
+    ).read_bytes()
+
+
+def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_path: Path) -> None:
+    desk.ok("POST", "/api/open", {"scenario": "mini"})
+    assert desk.refused("GET", "/api/ranking")[0] == 404
+    assert desk.refused("POST", "/api/score", {"site": "pole_a"})[0] == 409
+    with listening(desk) as events:
+        desk.ok("POST", "/api/run", {})
+        assert desk.refused("POST", "/api/run", {})[0] == 409
+        assert desk.refused("PATCH", "/api/sites/pole_a", {"z_m": 4})[0] == 409
+        assert next_event(events, "job")["state"] == "runs"
+        assert desk.ok("POST", "/api/stop", {})["job"]["state"] == "stopped"
+        assert desk.refused("POST", "/api/stop", {})[0] == 409
+        desk.ok("POST", "/api/run", {})
+        desk.wait()
+        assert desk.project["run"]["state"] == "complete"
+
+        desk.ok("PATCH", "/api/sites/pole_a", {"x_m": 11})
+        assert desk.project["run"]["state"] == "outdated"
+        assert desk.ok("GET", "/api/ranking")["outdated"]
+        desk.ok("POST", "/api/undo", {})
+        assert desk.project["run"]["state"] == "complete"
+
+        desk.ok("PATCH", "/api/sites/pole_b", {"must": True})
+        assert desk.project["run"]["state"] == "complete"
+        lorry = {"name": "lorry1", "x_m": 20, "y_m": 5, "yaw_deg": 0, "length_m": 12, "width_m": 2.5, "height_m": 3.8}
+        desk.ok("PUT", "/api/obstacles", {"obstacles": [lorry]})
+        assert desk.refused("GET", "/api/what_if")[0] == 404
+        desk.ok("POST", "/api/what_if", {})
+        desk.wait()
+        compared = desk.ok("GET", "/api/what_if")
+        assert not compared["outdated"] and "of the time" in compared["text"][0]
+        assert {row["pole"] for row in compared["poles"]} == {"pole_a", "pole_b"}
+        desk.ok("PUT", "/api/obstacles", {"obstacles": []})
+        assert desk.ok("GET", "/api/what_if")["outdated"]
+        desk.ok("POST", "/api/plan", {"count": 1})
+        desk.wait()
+        assert [each["pole"] for each in desk.ok("GET", "/api/plan")["sensors"]] == ["pole_b"]
+        assert not desk.project["run"]["plan_outdated"]
+        desk.ok("PATCH", "/api/sites/pole_b", {"must": False})
+        assert desk.project["run"]["plan_outdated"]
+
+        before = (tmp_path / "work" / "runs" / "mini" / "scores.parquet").read_bytes()
+        for number in range(3):
+            desk.ok("POST", "/api/score", {"site": "pole_a", "x_m": 10 + number / 10, "request": number})
+        while (answer := next_event(events, "score"))["request"] != 2:
+            assert answer["ok"]
+        assert answer["ok"] and answer["rank"] in (1, 2)
+        desk.ok("PATCH", "/api/sites/pole_a", {"x_m": 11})  # the ranking is that of the run all the same
+        desk.ok("POST", "/api/score", {"site": "pole_a", "x_m": 16, "y_m": 6, "request": 3})
+        refused = next_event(events, "score")
+        assert not refused["ok"] and "house" in str(refused["message"])
+        assert (tmp_path / "work" / "runs" / "mini" / "scores.parquet").read_bytes() == before
+
+
+def test_mistakes_with_maps_are_explained(desk: Client) -> None:
+    dropped = desk.ok("POST", "/api/maps?name=broken.osm", b"<osm><script>alert(1)</script>")
+    desk.ok("POST", f"/api/maps/{dropped['id']}/read", {})
+    message = desk.wait("failed")["message"]
+    assert "broken.osm" in message and "/upload" not in message
+    assert desk.ok("GET", f"/api/maps/{dropped['id']}")["message"] == message
+    bare = (
+        MAP.read_bytes()
+        .replace(b'v="street_lamp"', b'v="x"')
+        .replace(b'k="highway" v="traffic_signals"', b'k="x" v="x"')
+    )
+    dropped = desk.ok("POST", "/api/maps?name=bare.osm", bare)
+    desk.ok("POST", "/api/new", {"map": dropped["id"], "name": "bare", "at": None, "poles": "existing"})
+    assert "no map has a street lamp" in desk.wait("failed")["message"]
+    for body, field in (
+        ({"map": "m9", "name": "x"}, ""), ({"map": dropped["id"], "name": "../x"}, "name"),
+        ({"map": dropped["id"], "name": "x", "at": "here"}, "at"),
+        ({"map": dropped["id"], "name": "x", "at": "a,b"}, "at"),
+        ({"map": dropped["id"], "name": "x", "poles": "all"}, "poles"),
+        ({"map": dropped["id"], "name": "x", "traffic": "none"}, "traffic"),
+    ):  # fmt: skip
+        assert desk.refused("POST", "/api/new", body)[2] == field
+
+
+def test_ends_with_its_jobs(tmp_path: Path) -> None:
+    (tmp_path / "work").mkdir()
+    program = subprocess.Popen(
+        [sys.executable, "-m", "egvs", "desk", str(tmp_path / "work"), "--no-browser"], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert program.stdout is not None
+    desk = Client(program.stdout.readline().split()[0])
+    dropped = desk.ok("POST", "/api/maps?name=town.osm", MAP.read_bytes())
+    desk.ok("POST", f"/api/maps/{dropped['id']}/read", {})
+    program.terminate()
+    begin_s = time.monotonic()
+    _, errors = program.communicate(timeout=60)
+    assert time.monotonic() - begin_s < 30
+    assert "Traceback" not in errors
