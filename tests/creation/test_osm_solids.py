@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import pytest
 from shapely.geometry import Point
 
 from egvs.core.errors import InputError
 from egvs.core.polygons import PairCount
+from egvs.creation.junctions import Streets
 from egvs.creation.map_parts import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap.solids import find_buildings
-from egvs.formats.osm import Bounds, OsmExtract, Tags, Way
+from egvs.formats.osm import Bounds, Member, OsmExtract, Relation, Tags, Way
+from egvs.traffic.network import Location, Network
+from tests.creation.small_maps import degrees
 
 XY = {1: (0.0, 0.0), 2: (10.0, 0.0), 3: (10.0, 10.0), 4: (0.0, 10.0)}
 
@@ -134,3 +139,64 @@ def test_messages_name_the_file_and_the_way(monkeypatch: pytest.MonkeyPatch) -> 
     extract = OsmExtract(dict.fromkeys(XY, (0.0, 0.0)), {}, square, (), Bounds(0, 0, 1, 1), False)
     with pytest.raises(InputError, match=r"^town\.osm: way 5: has 4 corners\. The limit is 3 corners"):
         list(find_buildings(extract, XY, ImportCounts(), PairCount("town.osm")))
+
+
+def ring(
+    number: int, at_m: tuple[float, float], tags: Tags, size_m: float = 10.0
+) -> tuple[dict[int, tuple[float, float]], Way]:
+    """A square and its nodes."""
+    x, y = at_m
+    corners = [(x, y), (x + size_m, y), (x + size_m, y + size_m), (x, y + size_m)]
+    nodes = {10 * number + corner: point for corner, point in enumerate(corners)}
+    return nodes, Way(number, (*nodes, 10 * number), tags)
+
+
+def town() -> OsmExtract:
+    """Objects in the window of 200 m around the middle, across its border, and far from it."""
+    house = {"building": "yes"}
+    rings = [
+        ring(1, (0, 0), house),
+        ring(2, (195, 0), house, 600.0),
+        ring(3, (2000, 0), house | {"height": "tall"}),
+        ring(4, (2100, 0), {"building": "roof"}),
+        ring(5, (2200, 0), house),
+        ring(6, (2200, 0), {"building:part": "yes"}),
+        ring(7, (2300, 0), house, 50.0),
+        ring(8, (2310, 10), {"building:part": "yes"}),
+        ring(9, (2400, 0), house | {"location": "underground"}),
+        ring(10, (2500, 0), {"building": "razed"}),
+        ring(11, (2600, 0), {}),
+        ring(12, (2605, 2), {}, 3.0),
+        ring(13, (-50, -900), {"landuse": "forest"}, 1800.0),
+        ring(14, (2700, 0), {"barrier": "wall"}),
+        ring(15, (100, 100), {"building:part": "yes"}),
+        ring(16, (-900, 100), house, 695.0),
+    ]
+    nodes = {number: degrees(at_m) for of_ring, _ in rings for number, at_m in of_ring.items()}
+    ways = {way.id: way for _, way in rings}
+    ways[17] = Way(17, (10, 30, 31), {"barrier": "fence"})
+    ways[18] = Way(18, (30, 31, 32), house)
+    ways[19] = Way(19, (30, 999, 31, 30), house)
+    ways[20] = Way(20, (999, 998, 997, 999), house)
+    members = (Member("way", 11, "outer"), Member("way", 12, "inner"))
+    relations = (
+        Relation(1, members, {"type": "multipolygon", "building": "yes"}),
+        Relation(2, (Member("way", 13, "outer"), Member("way", 3, "outer")), {"type": "multipolygon"}),
+    )
+    return OsmExtract(nodes, {30: {"natural": "tree"}}, ways, relations, Bounds(51, 9, 53, 11), True)
+
+
+def test_far_objects_are_counted_as_if_they_were_made() -> None:
+    projection = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
+    streets = Streets(Network((), (), (), 0.0, Location(projection, (0.0, 0.0))), {}, ())
+    lat_deg, lon_deg = degrees((0.0, 0.0))
+    window = Point(streets.to_xy([lon_deg], [lat_deg])[0]).buffer(200.0)
+
+    every, _ = osm_solids.map_solids(town(), streets)
+    near, counts = osm_solids.map_solids(town(), streets, window=window)
+    assert near == [solid for solid in every if window.intersects(solid.area)]
+    assert {solid.name for solid in near} >= {"way/1", "way/2", "way/15", "way/17"}
+    far = Counter(solid.kind for solid in every if not window.intersects(solid.area))
+    assert counts.dropped.pop("out_of_range") == far - Counter(tree_trunk=1, tree_crown=1) + Counter(tree=1)
+    assert counts.dropped == {"underground": {"building": 1}, "incomplete": {"building": 3}}
+    assert counts.unreadable == {"height": 1} and counts.not_modelled == {"building=razed": 1}

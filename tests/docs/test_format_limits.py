@@ -29,6 +29,7 @@ from egvs.world import footprints
 from tests.docs.pages import DOCS, ROOT
 from tests.formats import foreign_files
 from tests.formats.test_e57 import ONE_POINT, write_e57
+from tests.formats.test_osm import pbf_of
 from tests.formats.test_point_clouds import las
 from tests.formats.test_small_files_that_grow import geoparquet
 from tests.formats.workbooks import write_xlsx
@@ -190,6 +191,12 @@ def osm_tag(mb: float) -> str:
     return "".join(f'<way id="{way}" version="1">{tags}</way>' for way in range(1, 1 + int(mb * 1000))) + "</osm>"
 
 
+def write_pbf(path: Path, mb: float) -> None:
+    source = path.with_suffix(".osm")
+    source.write_text(OSM.replace("</osm>", osm_tag(mb)))
+    pbf_of(source, path, with_bounds=False)
+
+
 GRID = "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2\n3 4\n"
 BOX = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
 CONFINED = {"EGVS_MAX_FILE_MB": 1, "EGVS_MAX_READER_MB": 20}
@@ -244,8 +251,12 @@ TRIALS = {
         "a.feather", write_feather, read_feather,
         {"EGVS_MAX_FILE_MB": 1, "EGVS_MAX_ROWS": 1, "EGVS_MAX_UNPACKED_MB": 1},
     ),
-    "OpenStreetMap (XML, PBF)": Trial(
+    "OpenStreetMap (XML)": Trial(
         "a.osm", lambda path, mb: path.write_text(OSM.replace("</osm>", osm_tag(mb))),  # type: ignore[arg-type,return-value]
+        osm.read_osm, {"EGVS_MAX_MAP_OBJECTS": 1, "EGVS_MAX_UNPACKED_MB": 1},
+    ),
+    "OpenStreetMap (PBF)": Trial(
+        "a.osm.pbf", write_pbf,
         osm.read_osm, {"EGVS_MAX_MAP_OBJECTS": 1, "EGVS_MAX_UNPACKED_MB": 1, "EGVS_MAX_READER_MB": 20},
     ),
     "points in CSV, PLY, PCD": Trial(

@@ -128,6 +128,8 @@ def check_corners(shape: BaseGeometry, where: object, factor: int = 1) -> None:
     """Raise an InputError when a polygon, with its holes, or a line has more corners than the limit times a factor."""
     import shapely
 
+    if shapely.get_num_coordinates(shape) <= factor * limits.CORNERS.maximum:
+        return
     parts = shapely.get_parts(shapely.get_parts(shape))
     is_polygon = shapely.get_type_id(parts) == shapely.GeometryType.POLYGON
     # a ring repeats its first corner at its end

@@ -56,9 +56,10 @@ def _cut_away(solid: MappedSolid, lanes: list[BaseGeometry], counts: ImportCount
 
 def geometry_pieces(geometry: BaseGeometry) -> list[BaseGeometry]:
     """Split a geometry into its polygons or, without any, its lines or points, in an order that depends on position."""
-    parts = []
-    for member in shapely.get_parts(geometry):
-        parts += [part for part in shapely.get_parts(member) if not part.is_empty]
+    parts = [geometry]
+    while any(hasattr(part, "geoms") for part in parts):  # get_parts is slow for what has none
+        parts = [*shapely.get_parts(parts)]
+    parts = [part for part in parts if not part.is_empty]
     polygons = []
     lines = []
     for part in parts:
@@ -66,7 +67,8 @@ def geometry_pieces(geometry: BaseGeometry) -> list[BaseGeometry]:
             polygons.append(shapely.geometry.polygon.orient(shapely.normalize(part)))
         elif isinstance(part, LineString):
             lines.append(part)
-    return sorted(polygons or lines or parts, key=lambda piece: (piece.bounds, piece.wkb))
+    pieces = polygons or lines or parts
+    return sorted(pieces, key=lambda piece: (piece.bounds, piece.wkb)) if len(pieces) > 1 else pieces
 
 
 def large_pieces(geometry: BaseGeometry) -> tuple[list[BaseGeometry], int]:

@@ -55,6 +55,9 @@ from egvs.traffic.demand import RouteFinder
 from egvs.traffic.network import CAR, Edge, Network
 from egvs.world.geolocation import network_world_frame
 
+_QUAD_SEGS = 16
+"""Segments of a quarter of a circle at the bends of a lane."""
+
 MIN_ARMS = 3
 """A junction that a user can choose connects at least this number of streets."""
 
@@ -216,7 +219,7 @@ class Streets:
 
     def node_positions(self, nodes: Mapping[int, tuple[float, float]]) -> dict[int, XY]:
         """World-frame x, y in metres of nodes of a map, given as latitude and longitude in degrees by identifier."""
-        lats_deg, lons_deg = zip(*nodes.values(), strict=True)
+        lats_deg, lons_deg = zip(*nodes.values(), strict=True) if nodes else ((), ())
         return dict(zip(nodes, self.to_xy(lons_deg, lats_deg), strict=True))
 
     def near(self, window: BaseGeometry) -> Streets:
@@ -300,7 +303,7 @@ def read_streets(path: Path) -> Streets:
     """
     network = road_network.read_net_xml(path)
     internal_edges = [edge for edge in network.all_edges if edge.function == "internal"]
-    areas = {edge.id: _lane_area(edge) for edge in (*network.edges, *internal_edges)}
+    areas = _lane_areas([*network.edges, *internal_edges])
 
     lanes_for_vehicles = set()
     roads_at_node: dict[str, list[Edge]] = {}
@@ -334,15 +337,23 @@ def read_streets(path: Path) -> Streets:
     return Streets(network, areas, tuple(junctions), tuple(large_rings))
 
 
-def _lane_area(edge: Edge) -> BaseGeometry:
-    """Return the area of an edge's lanes at full width, without pavements."""
-    strips = []
-    for lane in edge.lanes:
-        if lane.is_pavement or len(np.unique(lane.shape_m, axis=0)) < 2:
-            continue
-        half_width_m = (lane.width_m or road_network.LANE_WIDTH_M) / 2
-        strips.append(LineString(lane.shape_m[:, :2]).buffer(half_width_m, cap_style="flat"))
-    return shapely.union_all(strips)
+def _lane_areas(edges: Sequence[Edge]) -> dict[str, BaseGeometry]:
+    """Return the area of the lanes of each edge at full width, without pavements."""
+    lanes = [
+        [lane for lane in edge.lanes if not lane.is_pavement and (lane.shape_m != lane.shape_m[0]).any()]
+        for edge in edges
+    ]
+    flat = [lane for of_edge in lanes for lane in of_edge]
+    points_m = [lane.shape_m[:, :2] for lane in flat]
+    half_widths_m = np.array([(lane.width_m or road_network.LANE_WIDTH_M) / 2 for lane in flat])
+    lines = shapely.linestrings(
+        np.concatenate([np.empty((0, 2)), *points_m]), indices=np.repeat(np.arange(len(flat)), [*map(len, points_m)])
+    )
+    strips = np.full((len(edges), max(map(len, lanes))), None, dtype=object)
+    strips[np.arange(strips.shape[1]) < np.array([*map(len, lanes)])[:, None]] = shapely.buffer(
+        lines, half_widths_m, quad_segs=_QUAD_SEGS, cap_style="flat"
+    )
+    return dict(zip([edge.id for edge in edges], shapely.union_all(strips, axis=1), strict=True))
 
 
 def _make_junction(

@@ -29,6 +29,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY
 from egvs.creation.junctions import StreetJunction, Streets
+from egvs.creation.openstreetmap import bounds_around, node_positions
 from egvs.creation.openstreetmap.street_network import is_road
 from egvs.formats.osm import OsmExtract, Tags, Way, parse_number
 
@@ -127,13 +128,15 @@ def find_other_levels(
     OtherLevels
         Empty where all ways are on the junction's level, or lead to it.
     """
-    xy = streets.node_positions(extract.nodes)
-    nearby = {}
-    for way in extract.ways.values():
-        if (is_road(way) or _is_bridge(way.tags)) and way.tags.get("area") != "yes":
-            piece = _WayInRegion(way, xy, region)
-            if not piece.line.is_empty:
-                nearby[way.id] = piece
+    area = bounds_around(streets, region)
+    ways = [
+        way
+        for way in extract.ways.values()
+        if (is_road(way) or _is_bridge(way.tags)) and way.tags.get("area") != "yes" and extract.is_near(way, area)
+    ]
+    xy = node_positions(extract, streets, {node for way in ways for node in way.nodes})
+    pieces = {way.id: _WayInRegion(way, xy, region) for way in ways}
+    nearby = {way_id: piece for way_id, piece in pieces.items() if not piece.line.is_empty}
 
     roads = {way_id: piece for way_id, piece in nearby.items() if is_road(piece.way)}
     nodes = {int(number) for number in re.findall(r"\d+", junction.id)}

@@ -19,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from scipy.spatial import KDTree
 from shapely.geometry import MultiPoint, Point
 from shapely.geometry.base import BaseGeometry
 
@@ -261,6 +260,8 @@ def _convex_hull(mesh: MappedMesh) -> BaseGeometry:
 
 def _squares_near_ground(mesh: MappedMesh, ground: MappedMesh) -> list[BaseGeometry]:
     """Return the squares of a grid that contain vertices of a surface a little above the ground."""
+    from scipy.spatial import KDTree  # its import takes long, and most maps need none
+
     nearest = KDTree(ground.vertices_m[:, :2]).query(mesh.vertices_m[:, :2])[1]
     height_m = mesh.vertices_m[:, 2] - ground.vertices_m[nearest, 2]
     low_m, high_m = _NEAR_GROUND_M

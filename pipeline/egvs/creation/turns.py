@@ -19,6 +19,7 @@ from xml.sax.saxutils import quoteattr
 
 from egvs.core import files
 from egvs.core.wording import by_number, list_first, number_of
+from egvs.formats import xml
 from egvs.traffic import sumo
 from egvs.traffic.network import CAR, TURNAROUNDS, Permission
 
@@ -60,6 +61,14 @@ class BuiltTurns:
     connections: set[Connection] = field(default_factory=set)
     u_turns: set[Connection] = field(default_factory=set)
     ends: dict[str, tuple[str, str]] = field(default_factory=dict)
+
+    @classmethod
+    def read(cls, network: Path) -> BuiltTurns:
+        """Read a ``.net.xml``."""
+        turns = cls()
+        for element in xml.iter_elements(network, "net"):
+            turns.add(element)
+        return turns
 
     def add(self, element: Element) -> None:
         """Take an element of a ``.net.xml``; only edges and connections count."""

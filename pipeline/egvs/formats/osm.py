@@ -1,8 +1,8 @@
 """Read OpenStreetMap files: XML (``.osm``, may be gzipped) and PBF (``.osm.pbf``), recognised by their content.
 
-Steps of :func:`read_osm`: check values that osmium does not check (XML only); read the objects with osmium, in a
-process of its own (:mod:`egvs.formats.reader_process`); keep the positions of nodes, tagged nodes, ways, relations, and
-the extract's bounds. :func:`write_xml` converts a PBF file to XML.
+Steps of :func:`read_osm`: let osmium convert PBF to XML, in a process of its own (:mod:`egvs.formats.reader_process`);
+read the tags of the XML, and check identifiers and positions; keep the positions of nodes, tagged nodes, ways,
+relations, and the extract's bounds.
 
 Coordinates are latitude and longitude in degrees (WGS 84), in multiples of 1e-7 degree (1 cm), as in OpenStreetMap.
 Objects are sorted by identifier, so that their order in the file does not matter. The meaning of tags:
@@ -11,16 +11,14 @@ https://wiki.openstreetmap.org/wiki/Map_features.
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import sys
 import tempfile
 from collections.abc import Generator
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,23 +27,18 @@ from egvs.core.errors import InputError
 from egvs.core.numbers import number_or_nan
 from egvs.formats import xml
 from egvs.formats.reader_process import Block, read_blocks, serve
-from egvs.formats.xml import PARSER_ENCODINGS
-
-if TYPE_CHECKING:
-    import osmium
-
 
 Tags = dict[str, str]
 
-_KINDS = {"n": "node", "w": "way", "r": "relation"}
+_KINDS = frozenset({"node", "way", "relation"})
 
 _HINT = "Download the extract again, or choose one with streets (.osm, .osm.pbf)."
 _MISSING_HINT = "Give the path of an extract (.osm, .osm.pbf)."
 _VALUE_HINT = "Correct the object in the file, or download the extract again."
 
 _CANNOT_READ = "cannot be read as OpenStreetMap data"
-_STEPS_PER_DEG = 10_000_000
-_RECORDS_AT_ONCE = 100_000
+_VERSION = "0.6"
+_DECIMALS = 7
 
 _FOOT_M = 0.3048
 _LENGTH = re.compile(r"(\d+(?:\.\d+)?|\d+,\d{1,2}|\.\d+)\s*(m|metres?|meters?|ft|feet|foot|')?", re.IGNORECASE)
@@ -101,6 +94,11 @@ class Bounds:
         """Return whether a position is inside or on the boundary."""
         return self.south_deg <= lat_deg <= self.north_deg and self.west_deg <= lon_deg <= self.east_deg
 
+    def meets(self, other: Bounds) -> bool:
+        """Return whether two rectangles have a common point."""
+        meets_lats = self.south_deg <= other.north_deg and other.south_deg <= self.north_deg
+        return meets_lats and self.west_deg <= other.east_deg and other.west_deg <= self.east_deg
+
 
 @dataclass(frozen=True)
 class OsmExtract:
@@ -132,6 +130,19 @@ class OsmExtract:
     declared: bool
     path: Path = field(default=Path("extract"), compare=False)
 
+    def way_bounds(self, way: Way) -> Bounds | None:
+        """Return the bounding box of a way; None if the extract has none of its nodes."""
+        positions = [self.nodes[node] for node in way.nodes if node in self.nodes]
+        if not positions:
+            return None
+        lats_deg, lons_deg = zip(*positions, strict=True)
+        return Bounds(min(lats_deg), min(lons_deg), max(lats_deg), max(lons_deg))
+
+    def is_near(self, way: Way, area: Bounds) -> bool:
+        """Return whether the bounding box of a way meets an area; a way without positions may be anywhere."""
+        bounds = self.way_bounds(way)
+        return bounds is None or bounds.meets(area)
+
 
 def read_osm(path: Path) -> OsmExtract:
     """Read an OpenStreetMap file, without objects that are marked as deleted.
@@ -143,49 +154,21 @@ def read_osm(path: Path) -> OsmExtract:
     """
     if not path.is_file():
         raise InputError(path, "no such file", _MISSING_HINT)
-    deleted = frozenset() if is_pbf(path) else _check_values_and_find_deleted(path)
-    nodes: dict[int, tuple[float, float]] = {}
-    node_tags: dict[int, Tags] = {}
-    ways: dict[int, Way] = {}
-    relations: dict[int, Relation] = {}
-    with closing(_read_objects(path, "records")) as blocks:
-        header = next(blocks, None)
-        box = header.values["box"] if header is not None else None
-        for block in blocks:
-            match block.values["type"]:
-                case "nodes":
-                    _add_nodes(path, block.content, deleted, nodes)
-                case "tags":
-                    node_tags |= {
-                        node: tags for node, tags in json.loads(bytes(block.content)) if ("n", node) not in deleted
-                    }
-                case "ways":
-                    for number, refs, tags in json.loads(bytes(block.content)):
-                        if ("w", number) not in deleted:
-                            ways[number] = Way(number, tuple(refs), tags)
-                case "relations":
-                    for number, members, tags in json.loads(bytes(block.content)):
-                        if ("r", number) not in deleted:
-                            relations[number] = Relation(number, tuple(Member(*member) for member in members), tags)
-    if not nodes:
-        raise InputError(path, "has no nodes", _HINT)
-    node_tags = dict(sorted(node_tags.items()))
-    ways = dict(sorted(ways.items()))
-    ordered = tuple(relations[number] for number in sorted(relations))
-    return OsmExtract(nodes, node_tags, ways, ordered, _bounds(box, nodes), box is not None, path)
+    limits.checked_size(path, limits.UNPACKED)
+    objects = _Objects(path)
+    with files.temporary_folder() as folder:
+        readable = path
+        if is_pbf(path):
+            readable = folder / "map.osm"
+            _convert_to_xml(path, readable)
+        xml.scan_tags(readable, "osm", objects.add, path)
+    return objects.extract()
 
 
 def is_pbf(path: Path) -> bool:
     """Return whether a file starts like OpenStreetMap's PBF format, whatever its name."""
     with path.open("rb") as file:
         return b"OSMHeader" in file.read(64)
-
-
-def write_xml(path: Path, xml: Path) -> None:
-    """Write all objects of an OpenStreetMap file as XML, the only format that netconvert reads."""
-    with closing(_read_objects(path, "xml")) as blocks, xml.open("wb") as file:
-        for block in blocks:
-            file.write(block.content)
 
 
 def parse_length_m(text: str) -> float | None:
@@ -209,103 +192,130 @@ def parse_number(text: str) -> float | None:
     return float(text) if _NUMBER.fullmatch(text.strip()) else None
 
 
-def _read_objects(path: Path, answer: str) -> Generator[Block, None, None]:
-    """Yield what another process reads with osmium, as :func:`_read_file` describes it."""
-    with ExitStack() as stack:
-        readable, form = path, "pbf"
-        if not is_pbf(path):
-            form = "osm.gz" if xml.is_gzip(path) else "osm"
-            if xml.file_encoding(path) not in PARSER_ENCODINGS:
-                readable, form = stack.enter_context(files.temporary_folder()) / "map.osm", "osm"
-                xml.copy_as_utf8(path, readable)
-        size = 0
-        for block in read_blocks(__name__, readable, str(path), _CANNOT_READ, [form, answer]):
+class _Objects:
+    """Collects the objects of an XML file from its tags.
+
+    Parameters
+    ----------
+    path
+        The file, for messages.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._n_objects, self._most = 0, limits.MAP_OBJECTS.maximum
+        self._numbers: list[int] = []
+        self._lats: list[str | None] = []
+        self._lons: list[str | None] = []
+        self._node_tags: dict[int, Tags] = {}
+        self._ways: dict[int, tuple[list[int], Tags]] = {}
+        self._relations: dict[int, tuple[list[Member], Tags]] = {}
+        self._bounds: Bounds | None = None
+        # of the object whose parts follow
+        self._kind, self._number = "", 0
+        self._refs: list[int] = []
+        self._members: list[Member] = []
+        self._tags: Tags = {}
+
+    def add(self, name: str, attributes: dict[str, str]) -> None:
+        """Add an object, or a part of the object before."""
+        if name == "nd":
+            self._refs.append(self._integer("ref", attributes))
+        elif name == "tag":
+            self._tags[attributes.get("k", "")] = attributes.get("v", "")
+        elif name in _KINDS:
+            self._add_object(name, attributes)
+        elif name == "member":
+            number, kind = self._integer("ref", attributes), attributes.get("type", "")
+            if kind not in _KINDS:
+                where = f"{self._path}: {self._kind} {self._number}: type of a member"
+                raise InputError(where, f"expected node, way or relation, got {kind!r}", _VALUE_HINT)
+            self._members.append(Member(kind, number, attributes.get("role", "")))
+        elif name == "bounds" and self._bounds is None:
+            keys = "minlat", "minlon", "maxlat", "maxlon"
+            south, west, north, east = (
+                self._degrees("bounds", key, attributes.get(key), limit)
+                for key, limit in zip(keys, (90.0, 180.0) * 2, strict=True)
+            )
+            self._bounds = Bounds(min(south, north), min(west, east), max(south, north), max(west, east))
+        elif name == "osm" and attributes.get("version") != _VERSION:
+            problem = f"{_CANNOT_READ} (expected version {_VERSION}, got {attributes.get('version')!r})"
+            raise InputError(self._path, problem, _HINT)
+
+    def _add_object(self, kind: str, attributes: dict[str, str]) -> None:
+        """Add a node, way or relation; the parts that follow belong to it."""
+        self._n_objects += 1
+        if self._n_objects > self._most:
+            hint = f"Use a smaller extract. {limits.MAP_OBJECTS.hint}"
+            raise InputError(self._path, f"has more than {self._most:,} objects", hint)
+        self._kind = kind
+        self._number = number = self._integer("id", attributes)
+        self._refs, self._members, self._tags = [], [], {}
+        if attributes.get("action") == "delete" or attributes.get("visible") == "false":
+            return
+        if kind == "node":
+            self._numbers.append(number)
+            self._lats.append(attributes.get("lat"))
+            self._lons.append(attributes.get("lon"))
+            self._node_tags[number] = self._tags
+        elif kind == "way":
+            self._ways[number] = self._refs, self._tags
+        else:
+            self._relations[number] = self._members, self._tags
+
+    def _integer(self, key: str, attributes: dict[str, str]) -> int:
+        try:
+            return int(attributes[key])
+        except (KeyError, ValueError):
+            where = f"<{self._kind}> id" if key == "id" else f"{self._kind} {self._number}: {key}"
+            problem = f"expected a whole number, got {attributes.get(key)!r}"
+            raise InputError(f"{self._path}: {where}", problem, _VALUE_HINT) from None
+
+    def _degrees(self, title: str, key: str, text: str | None, limit: float) -> float:
+        value = number_or_nan(text or "")
+        if not abs(value) <= limit:
+            problem = f"expected degrees from {-limit:g} to {limit:g}, got {text!r}"
+            raise InputError(f"{self._path}: {title}: {key}", problem, _VALUE_HINT)
+        return round(value, _DECIMALS)
+
+    def _node_degrees(self, key: str, texts: list[str | None], limit: float) -> list[float]:
+        values = np.array([number_or_nan(text or "") for text in texts])
+        for index in np.flatnonzero(~(np.abs(values) <= limit))[:1]:
+            self._degrees(f"node {self._numbers[index]}", key, texts[index], limit)
+        rounded: list[float] = np.round(values, _DECIMALS).tolist()
+        return rounded
+
+    def extract(self) -> OsmExtract:
+        """Return all objects; InputError when there are no nodes, or one has no valid position."""
+        if not self._numbers:
+            raise InputError(self._path, "has no nodes", _HINT)
+        lats_deg, lons_deg = self._node_degrees("lat", self._lats, 90.0), self._node_degrees("lon", self._lons, 180.0)
+        nodes = dict(zip(self._numbers, zip(lats_deg, lons_deg, strict=True), strict=True))
+        node_tags = {number: tags for number, tags in sorted(self._node_tags.items()) if tags}
+        ways = {number: Way(number, tuple(refs), tags) for number, (refs, tags) in sorted(self._ways.items())}
+        relations = [Relation(number, tuple(parts), tags) for number, (parts, tags) in sorted(self._relations.items())]
+        bounds = self._bounds or Bounds(min(lats_deg), min(lons_deg), max(lats_deg), max(lons_deg))
+        return OsmExtract(nodes, node_tags, ways, tuple(relations), bounds, self._bounds is not None, self._path)
+
+
+def _convert_to_xml(path: Path, copy: Path) -> None:
+    """Write the objects of a PBF file as XML, with osmium in another process."""
+    size = 0
+    with closing(read_blocks(__name__, path, str(path), _CANNOT_READ)) as blocks, copy.open("wb") as file:
+        for block in blocks:
             size += len(block.content)
             limits.UNPACKED.check_bytes(path, size, f"holds more than {limits.UNPACKED.maximum:,} MB")
-            yield block
-
-
-def _add_nodes(
-    path: Path, content: bytes | memoryview, deleted: frozenset[tuple[str, int]], nodes: dict[int, tuple[float, float]]
-) -> None:
-    """Add the positions of a block of nodes."""
-    numbers, lats, lons = np.frombuffer(content, dtype="<i8").reshape(3, -1)
-    if deleted:
-        is_deleted = np.isin(numbers, [number for kind, number in deleted if kind == "n"])
-        numbers, lats, lons = numbers[~is_deleted], lats[~is_deleted], lons[~is_deleted]
-    is_valid = (np.abs(lats) <= 90 * _STEPS_PER_DEG) & (np.abs(lons) <= 180 * _STEPS_PER_DEG)
-    if not is_valid.all():
-        raise InputError(f"{path}: node {numbers[~is_valid][0]}", "has no valid position", _VALUE_HINT)
-    positions = zip((lats / _STEPS_PER_DEG).tolist(), (lons / _STEPS_PER_DEG).tolist(), strict=True)
-    nodes.update(zip(numbers.tolist(), positions, strict=True))
-
-
-def _bounds(box: list[float] | None, nodes: dict[int, tuple[float, float]]) -> Bounds:
-    """Return the rectangle that the file declares, else that of its nodes."""
-    if box is not None:
-        return Bounds(*box)
-    lats, lons = zip(*nodes.values(), strict=True)
-    return Bounds(min(lats), min(lons), max(lats), max(lons))
-
-
-def _check_values_and_find_deleted(path: Path) -> frozenset[tuple[str, int]]:
-    """Reject values that osmium reads as 0, or whose object its messages do not name.
-
-    Returns the objects that an editor has marked as deleted, which osmium ignores: (first letter of type, identifier).
-    """
-    deleted = set()
-    for element in xml.iter_elements(path, "osm"):
-        name = element.get("id", "")
-        if element.tag in _KINDS.values():
-            identifier = _parse_integer(path, f"<{element.tag}> id", element.get("id"))
-            if element.get("action") == "delete":
-                deleted.add((element.tag[0], identifier))
-            elif element.tag == "node" and element.get("visible") != "false":
-                _check_degrees(path, f"node {name}: lat", element.get("lat"), 90.0)
-                _check_degrees(path, f"node {name}: lon", element.get("lon"), 180.0)
-            for member in element:
-                if member.tag != "tag":
-                    _parse_integer(path, f"{element.tag} {name}: ref", member.get("ref"))
-        elif element.tag == "bounds":
-            for key, limit in (("minlat", 90.0), ("minlon", 180.0), ("maxlat", 90.0), ("maxlon", 180.0)):
-                _check_degrees(path, f"bounds: {key}", element.get(key), limit)
-    return frozenset(deleted)
-
-
-def _parse_integer(path: Path, key: str, text: str | None) -> int:
-    try:
-        return int(text or "")
-    except ValueError:
-        raise InputError(f"{path}: {key}", f"expected a whole number, got {text!r}", _VALUE_HINT) from None
-
-
-def _check_degrees(path: Path, key: str, text: str | None, limit: float) -> None:
-    value = number_or_nan(text or "")
-    if not abs(value) <= limit:
-        problem = f"expected degrees from {-limit:g} to {limit:g}, got {text!r}"
-        raise InputError(f"{path}: {key}", problem, _VALUE_HINT)
+            file.write(block.content)
 
 
 # --- in the other process ---
 
 
 def _read_file(path: Path) -> Generator[Block, None, None]:
-    """Yield the objects of a file, deleted ones left out: as records, or as XML.
-
-    Records: a block with the declared bounds (south, west, north, east in degrees, or None), then blocks of nodes
-    (identifiers, latitudes and longitudes in multiples of 1e-7 degree, (3, n) int64), and blocks of tags, ways and
-    relations as lists in JSON.
-    """
+    """Yield the objects of a PBF file as XML, deleted ones left out."""
     import osmium
 
-    form, answer = sys.argv[2:]
-    objects = osmium.FileProcessor(osmium.io.File(path, form))
-    yield from _xml_blocks(objects) if answer == "xml" else _record_blocks(objects, path)
-
-
-def _xml_blocks(objects: osmium.FileProcessor) -> Generator[Block, None, None]:
-    import osmium
-
+    objects = osmium.FileProcessor(osmium.io.File(path, "pbf"))
     copy = Path(tempfile.gettempdir()) / "map.osm"
     header = osmium.io.Header()
     if (box := objects.header.box()).valid():
@@ -317,69 +327,6 @@ def _xml_blocks(objects: osmium.FileProcessor) -> Generator[Block, None, None]:
     with copy.open("rb") as file:
         while chunk := file.read(limits.MB):
             yield Block({}, chunk)
-
-
-def _record_blocks(objects: osmium.FileProcessor, path: Path) -> Generator[Block, None, None]:
-    box = objects.header.box()
-    corners = (box.bottom_left, box.top_right)
-    yield Block({"box": [degrees for at in corners for degrees in (at.lat, at.lon)] if box.valid() else None})
-
-    records = _Records()
-    limit = limits.MAP_OBJECTS.maximum
-    for number, o in enumerate(objects):
-        if number == limit:
-            hint = f"Use a smaller extract. {limits.MAP_OBJECTS.hint}"
-            raise InputError(path, f"has more than {limit:,} objects", hint)
-        records.add(o)
-        if records.size >= _RECORDS_AT_ONCE:
-            yield from records.blocks()
-            records = _Records()
-    yield from records.blocks()
-
-
-class _Records:
-    """Objects of a file as numbers and lists.
-
-    Attributes
-    ----------
-    size
-        Number of nodes, references, members and tags.
-    """
-
-    def __init__(self) -> None:
-        self.size = 0
-        self._nodes: tuple[list[int], list[int], list[int]] = ([], [], [])
-        self._lists: dict[str, list[Any]] = {"tags": [], "ways": [], "relations": []}
-
-    def add(self, o: Any) -> None:
-        """Add an object; changesets and deleted objects are ignored."""
-        kind = o.type_str()
-        if kind == "c" or not o.visible:
-            return
-        tags = dict(o.tags) if len(o.tags) else {}
-        self.size += 1 + len(tags)
-        if kind == "n":
-            location = o.location
-            for values, value in zip(self._nodes, (o.id, location.y, location.x), strict=True):
-                values.append(value)
-            if tags:
-                self._lists["tags"].append((o.id, tags))
-        elif kind == "w":
-            refs = [node.ref for node in o.nodes]
-            self.size += len(refs)
-            self._lists["ways"].append((o.id, refs, tags))
-        else:
-            members = [(_KINDS[member.type], member.ref, member.role) for member in o.members]
-            self.size += len(members)
-            self._lists["relations"].append((o.id, members, tags))
-
-    def blocks(self) -> Generator[Block, None, None]:
-        """Yield what has been added."""
-        if self._nodes[0]:
-            yield Block({"type": "nodes"}, np.array(self._nodes, dtype="<i8").tobytes())
-        for kind, rows in self._lists.items():
-            if rows:
-                yield Block({"type": kind}, json.dumps(rows).encode())
 
 
 def _use_one_thread() -> None:

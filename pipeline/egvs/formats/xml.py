@@ -1,7 +1,7 @@
 """Read a user's XML safely and in pieces, in any common encoding.
 
 Steps: decompress gzip, recognised by the first two bytes; convert encodings that XML parsers do not know to UTF-8;
-parse with defusedxml, which rejects entities and document types; yield one child of the root at a time and forget it.
+parse with expat, reject document types, and thereby entities; yield one child of the root at a time and forget it.
 The decompressed size, and the size and depth of a child, are limited. Whatever is wrong with the file becomes an
 :class:`InputError` that names it.
 
@@ -17,11 +17,11 @@ import gzip
 import io
 import re
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import IO, Any, cast
-from xml.etree.ElementTree import Element, ParseError, TreeBuilder
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 
 from egvs.core import limits
 from egvs.core.digests import open_input
@@ -47,6 +47,7 @@ _ALIASES = {"windows-31j": "cp932", "x-sjis": "cp932"}
 
 _ENCODING_DECLARATION = re.compile(rb"""(?:\xef\xbb\xbf)?<\?xml[^>]*?\bencoding\s*=\s*["']([^"']{0,80})["']""")
 _HEAD_BYTES = 512
+_CHUNK_BYTES = 1 << 16
 _UTF_16_STARTS = (b"\xff\xfe", b"\xfe\xff", b"<\x00", b"\x00<")
 
 
@@ -122,7 +123,7 @@ def read_line(file: IO[bytes], where: object) -> bytes:
 def iter_elements(
     path: Path, root: str, name: Path | None = None, on_root: Callable[[Element], None] | None = None
 ) -> Iterator[Element]:
-    """Yield the children of the root element one by one; a child is cleared when the next is requested.
+    """Yield the children of the root element one by one, and forget them.
 
     Parameters
     ----------
@@ -141,52 +142,113 @@ def iter_elements(
         When the root has another tag, the XML is malformed or declares entities or a document type, a child is too
         large or too deep, its gzip is damaged, or its encoding is unknown.
     """
-    where = name or path
-    max_events = 2 * limits.XML_ELEMENTS.maximum  # each has a start and an end
-    with _parse(path, name) as (events, meter):
-        _, top = next(events)
-        if root and top.tag != root:
-            raise InputError(where, f"expected the root element <{root}>, got <{top.tag}>", "Check the file name.")
-        if on_root is not None:
-            on_root(top)
-        depth = 0
-        for number, (event, element) in enumerate(events):
-            depth += 1 if event == "start" else -1
-            if number > max_events:
-                limits.XML_ELEMENTS.check(where, number, f"has more than {max_events // 2:,} elements")
-            if depth > MAX_DEPTH:
-                raise InputError(where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
-            if event == "end" and depth == 0:
-                meter.bytes_since_child = 0
-                yield element
-                top.clear()
+    children = _Children(name or path, root)
+    for meter in _parse(path, name, children):
+        if on_root is not None and children.root is not None:
+            on_root(children.root)
+            on_root = None
+        if children.complete:
+            meter.bytes_since_child = 0
+        yield from children.pop()
 
 
 def read_root_tag(path: Path) -> str:
     """Return the tag of the root, with its namespace as in ``{http://...}kml``; errors are those of iter_elements."""
-    with _parse(path, None) as (events, _):
-        return str(next(events)[1].tag)
+    children = _Children(path, "")
+    with closing(_parse(path, None, children)) as chunks:
+        root = next(children.root for _ in chunks if children.root is not None)
+        return str(root.tag)
 
 
-@contextmanager
-def _parse(path: Path, name: Path | None) -> Iterator[tuple[Iterator[tuple[str, Any]], _ElementMeter]]:
-    """Yield the starts and ends of elements, and what counts the bytes of each child of the root."""
-    from defusedxml.common import DefusedXmlException
-    from defusedxml.ElementTree import DefusedXMLParser, iterparse
+def scan_tags(path: Path, root: str, on_tag: Callable[[str, dict[str, str]], None], name: Path | None = None) -> None:
+    """Call a function with the name and the attributes of each element, the root's first; texts are left out.
 
+    Much faster than :func:`iter_elements`. Parameters and errors are the same, but elements may be nested.
+    """
+    tags, count = _Tags(name or path, root, on_tag), 0
+    for meter in _parse(path, name, tags):
+        if tags.count > count:
+            count, meter.bytes_since_child = tags.count, 0
+
+
+def _parse(path: Path, name: Path | None, target: _Tags) -> Generator[_ElementMeter, None, None]:
+    """Parse a file; yields after each piece of it what counts its bytes."""
     where = name or path
     encoding = file_encoding(path, where)
     with open_bounded(path, name) as file, translate_errors(where):
         is_decoded = encoding not in PARSER_ENCODINGS
         meter = _ElementMeter(Utf8Reader(file, encoding) if is_decoded else file, where)
-        parser = DefusedXMLParser(target=TreeBuilder(), encoding="utf-8" if is_decoded else None, forbid_dtd=True)
+        parser = XMLParser(target=target, encoding="utf-8" if is_decoded else None)
         try:
-            yield iterparse(meter, ("start", "end"), parser), meter
+            while chunk := meter.read(_CHUNK_BYTES):
+                parser.feed(chunk)
+                yield meter
+            parser.close()
         except ParseError as error:
             raise InputError(where, f"is not well-formed XML: {error}", COMPLETE_FILE) from None
-        except DefusedXmlException:
-            problem = "declares XML entities or a document type, which are not allowed"
-            raise InputError(where, problem, "Remove <!DOCTYPE ...> from the file.") from None
+        yield meter
+
+
+class _Tags:
+    """Passes the start of each element on; the target of a parser.
+
+    Parameters
+    ----------
+    where
+        The file, for messages.
+    root
+        Expected tag of the root; any if empty.
+    on_tag
+        Called with the name and the attributes of each element.
+    """
+
+    def __init__(self, where: object, root: str, on_tag: Callable[[str, dict[str, str]], object]) -> None:
+        self._where, self._expected_root, self._on_tag = where, root, on_tag
+        self.count, self._most = 0, limits.XML_ELEMENTS.maximum
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        if self.count == 0 and self._expected_root and tag != self._expected_root:
+            problem = f"expected the root element <{self._expected_root}>, got <{tag}>"
+            raise InputError(self._where, problem, "Check the file name.")
+        self.count += 1
+        if self.count > self._most:
+            limits.XML_ELEMENTS.check(self._where, self.count, f"has more than {self._most:,} elements")
+        self._on_tag(tag, attributes)
+
+    def doctype(self, *_: object) -> None:
+        problem = "declares XML entities or a document type, which are not allowed"
+        raise InputError(self._where, problem, "Remove <!DOCTYPE ...> from the file.")
+
+
+class _Children(_Tags):
+    """Builds the children of the root element."""
+
+    def __init__(self, where: object, root: str) -> None:
+        super().__init__(where, root, self._open)
+        self._builder, self._depth = TreeBuilder(), 0
+        self.root: Element | None = None
+        self.complete: list[Element] = []
+        self.data, self.close = self._builder.data, self._builder.close
+
+    def _open(self, tag: str, attributes: dict[str, str]) -> None:
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise InputError(self._where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
+        element = self._builder.start(tag, attributes)
+        self.root = element if self.root is None else self.root
+
+    def end(self, tag: str) -> None:
+        self._depth -= 1
+        element = self._builder.end(tag)
+        if self._depth == 1:
+            self.complete.append(element)
+
+    def pop(self) -> list[Element]:
+        """Return the children that are complete, and forget them."""
+        complete, self.complete = self.complete, []
+        if complete and self.root is not None:
+            self.root.clear()
+        return complete
 
 
 def scan_attribute_values(path: Path, attribute: str) -> Iterator[bytes]:

@@ -20,9 +20,13 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
 
+import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
@@ -31,8 +35,9 @@ from egvs.core.polygons import PairCount, check_corners, check_crossings, repair
 from egvs.creation.carriageway import clear_of_carriageway, geometry_pieces, lanes_under, large_pieces
 from egvs.creation.junctions import Streets
 from egvs.creation.map_parts import DECK_BASE_M, DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedPole, MappedSolid
+from egvs.creation.openstreetmap import bounds_around, node_positions
 from egvs.creation.openstreetmap.street_network import PATH_HIGHWAYS
-from egvs.formats.osm import OsmExtract, Relation, Tags, Way, parse_number
+from egvs.formats.osm import Bounds, OsmExtract, Relation, Tags, Way, parse_number
 from egvs.world import map_features
 from egvs.world.clearances import CLEARANCE_M
 from egvs.world.map_features import SolidType, SolidTypes, VerticalExtent
@@ -48,8 +53,10 @@ _DECK_LANE_M, _DECK_EDGE_M, _TRACK_M, _PATH_M = 3.5, 1.0, 5.0, 3.0
 """Widths of bridges without a width in the map: of each lane, of each edge, of a railway track, and of a path."""
 
 
-_SOLID_TYPES = SolidTypes()
+_area_type = lru_cache(1000)(SolidTypes().area_type)
 _BUILDING_KEYS = ("building:part", "building", "man_made")
+_SOLID_KEYS = frozenset({*_BUILDING_KEYS, "barrier", "natural"})
+"""Keys of ways that may be static objects."""
 
 CARRYING_POLES = {
     "highway.street_lamp": "lamp", "highway.traffic_signals": "signal", "man_made.utility_pole": "pole",
@@ -83,8 +90,14 @@ def map_solids(
     counts : ImportCounts
         What happened to the mapped objects.
     """
-    xy = streets.node_positions(extract.nodes)
     counts = ImportCounts()
+    if window is not None:
+        extract = _within_reach(extract, streets, window, counts)
+    xy = node_positions(
+        extract,
+        streets,
+        {*extract.node_tags, *(node for way in (*extract.ways.values(), *bridges) for node in way.nodes)},
+    )
     pairs = PairCount(extract.path)
     lanes = shapely.STRtree(list(streets.areas.values()))
 
@@ -108,6 +121,45 @@ def map_solids(
         counts.keep(crown)
         solids += [trunk, _above_traffic(crown, lanes, counts)]
     return solids, counts
+
+
+def _within_reach(extract: OsmExtract, streets: Streets, window: BaseGeometry, counts: ImportCounts) -> OsmExtract:
+    """Return the extract with only those ways that may be solid, without far buildings: these are only counted."""
+    area = bounds_around(streets, window)
+    relations = [relation for relation in extract.relations if _multipolygon_tags(relation, extract) is not None]
+    of_relations = {way_id for relation in relations for way_id in relation.ways("outer", "", "inner")}
+    kept: dict[int, Way] = {}
+    far: dict[int, Bounds] = {}
+    parts: list[Bounds] = []
+    for way in extract.ways.values():
+        if way.id not in of_relations and _SOLID_KEYS.isdisjoint(way.tags):
+            continue
+        kept[way.id] = way
+        bounds = extract.way_bounds(way)
+        if bounds is not None and (way.id in of_relations or "building:part" in way.tags):
+            parts.append(bounds)
+        elif bounds is not None and not bounds.meets(area) and _is_complete_outline(way, extract.nodes):
+            far[way.id] = bounds
+    # parts may cover an outline, which then is no object
+    with_parts = {*shapely.STRtree(_boxes(parts)).query(_boxes(far.values()))[0].tolist()}
+    for number, way_id in enumerate(far):
+        if number not in with_parts:
+            tags = kept.pop(way_id).tags
+            solid = _building_type(tags)
+            extent_from_tags(tags, solid, counts)
+            counts.drop(_building_kind(solid), OUT_OF_RANGE)
+    return dataclasses.replace(extract, ways=kept)
+
+
+def _boxes(bounds: Iterable[Bounds]) -> NDArray[Any]:
+    corners_deg = [(box.west_deg, box.south_deg, box.east_deg, box.north_deg) for box in bounds]
+    boxes: NDArray[Any] = shapely.box(*np.array(corners_deg).reshape(-1, 4).T)
+    return boxes
+
+
+def _is_complete_outline(way: Way, nodes: Mapping[int, XY]) -> bool:
+    is_outline = way.closed and _is_outline(way.tags) and not map_features.is_underground(way.tags)
+    return is_outline and _has_positions(way, nodes)
 
 
 def _is_outside(solid: MappedSolid, window: BaseGeometry | None) -> bool:
@@ -215,11 +267,15 @@ def find_buildings(
 def _make_building(name: str, tags: Tags, pieces: list[BaseGeometry], counts: ImportCounts) -> MappedSolid:
     solid = _building_type(tags)
     extent = extent_from_tags(tags, solid, counts)
-    kind = "roof" if solid.thickness_m else "building"
     source = extent.source
     if source == "default" and solid.height_m:
         source = "type"
+    kind = _building_kind(solid)
     return MappedSolid(name, kind, shapely.MultiPolygon(pieces), extent.top_m, source, extent.base_m)
+
+
+def _building_kind(solid: SolidType) -> str:
+    return "roof" if solid.thickness_m else "building"
 
 
 def _solid_type(tags: Tags, key: str) -> SolidType | None:
@@ -227,7 +283,7 @@ def _solid_type(tags: Tags, key: str) -> SolidType | None:
     value = tags.get(key, "no")
     if value == "no":
         return None
-    return _SOLID_TYPES.area_type(f"{key.removesuffix(':part')}.{value}")
+    return _area_type(f"{key.removesuffix(':part')}.{value}")
 
 
 def _is_outline(tags: Tags) -> bool:
@@ -286,7 +342,7 @@ def _footprints(
             yield f"way/{way.id}", way.tags, way_area(way, xy, counts, pairs)
 
 
-def _has_positions(way: Way, xy: dict[int, XY]) -> bool:
+def _has_positions(way: Way, xy: Mapping[int, XY]) -> bool:
     return all(node in xy for node in way.nodes)
 
 
@@ -337,7 +393,7 @@ def find_barriers(
         value = way.tags.get("barrier", "no")
         if value == "no":
             continue
-        solid = _SOLID_TYPES.area_type(f"barrier.{value}")
+        solid = _area_type(f"barrier.{value}")
         if solid is None:
             counts.not_modelled[f"barrier={value}"] += 1
             continue
@@ -416,13 +472,19 @@ def find_poles(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) -> 
 
 def carrying_poles(extract: OsmExtract, streets: Streets, window: BaseGeometry | None) -> tuple[MappedPole, ...]:
     """Return the poles of :data:`CARRYING_POLES` in a window (world frame); parameters as of :func:`map_solids`."""
-    xy = streets.node_positions(extract.nodes)
-    poles = []
+    kinds = {}
     for node, tags in extract.node_tags.items():
-        kinds = [CARRYING_POLES[f"{key}.{value}"] for key, value in tags.items() if f"{key}.{value}" in CARRYING_POLES]
-        if kinds and (window is None or window.covers(point_at(xy[node]))):
-            poles.append(MappedPole(f"node/{node}", kinds[0], xy[node]))
-    return tuple(poles)
+        of_node = [
+            CARRYING_POLES[f"{key}.{value}"] for key, value in tags.items() if f"{key}.{value}" in CARRYING_POLES
+        ]
+        if of_node:
+            kinds[node] = of_node[0]
+    xy = node_positions(extract, streets, kinds)
+    return tuple(
+        MappedPole(f"node/{node}", kind, xy[node])
+        for node, kind in kinds.items()
+        if window is None or window.covers(point_at(xy[node]))
+    )
 
 
 def _pole_type(tags: Tags) -> SolidType | None:

@@ -28,11 +28,11 @@ from egvs.core.errors import InputError, RunError
 from egvs.core.grid import XY
 from egvs.creation import junctions
 from egvs.creation.junctions import StreetJunction, Streets
-from egvs.creation.openstreetmap import ATTRIBUTION, EARTH_M, street_turns
+from egvs.creation.openstreetmap import ATTRIBUTION, EARTH_M, node_positions, street_turns
 from egvs.creation.openstreetmap.restrictions import is_restriction, restrictions_of_pieces
 from egvs.creation.openstreetmap.street_signals import number_crossings, signals_at_stop_lines, without_signal
 from egvs.creation.plain_network import NETWORK_FILE
-from egvs.formats.osm import OsmExtract, Way, parse_number
+from egvs.formats.osm import Bounds, OsmExtract, Way, parse_number
 from egvs.traffic import sumo
 from egvs.traffic.assumed_plans import assumed_plan
 from egvs.traffic.network import Location, Network
@@ -289,20 +289,8 @@ def drop_far_streets(extract: OsmExtract, middle: tuple[float, float], distance_
     lat_deg, lon_deg = middle
     north_deg = math.degrees(distance_m / EARTH_M)
     east_deg = north_deg / math.cos(math.radians(lat_deg))
-
-    def is_near(way: Way) -> bool:
-        positions = [extract.nodes[node] for node in way.nodes if node in extract.nodes]
-        if not positions:
-            return True
-        lats, lons = [lat for lat, _ in positions], [lon for _, lon in positions]
-        return (
-            min(lats) <= lat_deg + north_deg
-            and max(lats) >= lat_deg - north_deg
-            and min(lons) <= lon_deg + east_deg
-            and max(lons) >= lon_deg - east_deg
-        )
-
-    far = {way.id for way in extract.ways.values() if "highway" in way.tags and not is_near(way)}
+    area = Bounds(lat_deg - north_deg, lon_deg - east_deg, lat_deg + north_deg, lon_deg + east_deg)
+    far = {way.id for way in extract.ways.values() if "highway" in way.tags and not extract.is_near(way, area)}
     relations = tuple(
         relation
         for relation in extract.relations
@@ -329,7 +317,7 @@ def cut_out_roads(extract: OsmExtract, streets: Streets, roads: Sequence[Way], r
     region
         World frame, metres.
     """
-    xy = streets.node_positions(extract.nodes)
+    xy = node_positions(extract, streets, {node for road in roads for node in road.nodes})
     ways = dict(extract.ways)
     cut: dict[int, Collection[Way]] = {}
     next_id = max(ways) + 1

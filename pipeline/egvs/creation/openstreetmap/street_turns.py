@@ -14,7 +14,8 @@ import math
 import re
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
@@ -165,6 +166,26 @@ class MapTurn:
     for_cars: bool
 
 
+@dataclass(frozen=True)
+class MapTurns:
+    """The turns that a map permits, as pairs of edges.
+
+    Attributes
+    ----------
+    for_cars, for_any
+        Turns that cars, or any vehicles, may take.
+    forth
+        Those that do not lead back.
+    off_arrows
+        Those for which no lane has an arrow, although all lanes have some.
+    """
+
+    for_cars: set[Pair] = field(default_factory=set)
+    for_any: set[Pair] = field(default_factory=set)
+    forth: set[Pair] = field(default_factory=set)
+    off_arrows: set[Pair] = field(default_factory=set)
+
+
 class StreetGraph:
     """The ways of a map, and the edges of the network made of them.
 
@@ -180,6 +201,8 @@ class StreetGraph:
 
     def __init__(self, extract: OsmExtract, network: Path, *, lefthand: bool) -> None:
         self._extract = extract
+        self._shrink = math.cos(math.radians(extract.bounds.south_deg))
+        self._xy_m: dict[int, XY] = {}
         self.lefthand = lefthand
         self._ways = {way.id: _mapped(way, extract) for way in extract.ways.values() if "highway" in way.tags}
         self.restrictions = read_restrictions(extract)
@@ -345,9 +368,10 @@ class StreetGraph:
         return _admits_cars(tags) and (along if step.forward else against)
 
     def _xy(self, node: int) -> XY:
-        lat_deg, lon_deg = self._extract.nodes[node]
-        shrink = math.cos(math.radians(self._extract.bounds.south_deg))
-        return EARTH_M * math.radians(lon_deg) * shrink, EARTH_M * math.radians(lat_deg)
+        if node not in self._xy_m:
+            lat_deg, lon_deg = self._extract.nodes[node]
+            self._xy_m[node] = EARTH_M * math.radians(lon_deg) * self._shrink, EARTH_M * math.radians(lat_deg)
+        return self._xy_m[node]
 
     def length_m(self, steps: Sequence[Step]) -> float:
         """Return the length of some pieces of ways."""
@@ -398,12 +422,28 @@ class StreetGraph:
         turned_deg = _wrap_deg(self.turned_deg(source, target))
         return not arrows or any(low <= turned_deg <= high for low, high in map(_ARROWS_DEG.__getitem__, arrows))
 
-    def connections_off_arrows(self) -> Iterator[Connection]:
+    @cached_property
+    def map_turns(self) -> MapTurns:
+        """The turns that the map permits between the edges."""
+        turns = MapTurns()
+        for edge in self.edges.values():
+            for turn in self.turns_from(edge, self.rules):
+                pair = turn.source, turn.target
+                turns.for_any.add(pair)
+                if not self.goes_back(turn):
+                    turns.forth.add(pair)
+                if not self.follows_arrows(turn):
+                    turns.off_arrows.add(pair)
+                if turn.for_cars and edge.car_lanes and self.edges[turn.target].car_lanes:
+                    turns.for_cars.add(pair)
+        return turns
+
+    def connections_off_arrows(self, built: BuiltTurns) -> Iterator[Connection]:
         """Yield the connections from lanes whose arrows mean other turns, where a street leads to several others.
 
         At a fork, the arrows may be those of the next junction: then the leftmost and rightmost way are left and right.
         """
-        by_pair = lanes_of_pairs(self.built.connections)
+        by_pair = lanes_of_pairs(built.connections)
         targets: dict[str, list[str]] = {}
         for source, target in by_pair:
             is_known = source in self.edges and target in self.edges
@@ -508,6 +548,8 @@ class StreetTurns:
     ----------
     graph
         The ways and edges.
+    built
+        The turns of the network.
     lost, added
         Turns that the network lacks, and that only the network has, as pairs of edges.
     relations
@@ -519,6 +561,7 @@ class StreetTurns:
     """
 
     graph: StreetGraph
+    built: BuiltTurns
     lost: tuple[Pair, ...]
     added: tuple[Pair, ...]
     relations: Mapping[Pair, frozenset[int]]
@@ -526,39 +569,15 @@ class StreetTurns:
     off_arrows: tuple[Connection, ...]
 
 
-def compare_with_map(extract: OsmExtract, network: Path, *, lefthand: bool = False) -> StreetTurns:
-    """Compare the turns of a network with those of its map.
-
-    Parameters
-    ----------
-    extract
-        The map.
-    network
-        The network, made with :data:`ORIGINAL_NAMES_FLAG`.
-    lefthand
-        Whether traffic drives on the left.
-    """
-    graph = StreetGraph(extract, network, lefthand=lefthand)
-    for_cars: set[Pair] = set()
-    for_any: set[Pair] = set()
-    forth: set[Pair] = set()
-    off_arrows: set[Pair] = set()
-    for edge in graph.edges.values():
-        for turn in graph.turns_from(edge, graph.rules):
-            pair = turn.source, turn.target
-            for_any.add(pair)
-            if not graph.goes_back(turn):
-                forth.add(pair)
-            if not graph.follows_arrows(turn):
-                off_arrows.add(pair)
-            if turn.for_cars and edge.car_lanes and graph.edges[turn.target].car_lanes:
-                for_cars.add(pair)
-    built = {pair for pair in graph.built.edge_pairs if pair[0] in graph.edges and pair[1] in graph.edges}
-    comparison = compare_turns(for_cars & forth - off_arrows, built, for_any)
+def compare_with_map(graph: StreetGraph, built: BuiltTurns) -> StreetTurns:
+    """Compare the turns that a network has, as netconvert made it or after a repair, with those of its map."""
+    turns = graph.map_turns
+    pairs = {pair for pair in built.edge_pairs if pair[0] in graph.edges and pair[1] in graph.edges}
+    comparison = compare_turns(turns.for_cars & turns.forth - turns.off_arrows, pairs, turns.for_any)
     relations = {pair: graph.forbidding(*pair) for pair in comparison.added}
-    back = [pair for pair in sorted(for_cars - forth - built) if not graph.is_same_street(*pair)]
-    off_lanes = tuple(graph.connections_off_arrows())
-    return StreetTurns(graph, comparison.lost, comparison.added, relations, tuple(back), off_lanes)
+    back = [pair for pair in sorted(turns.for_cars - turns.forth - pairs) if not graph.is_same_street(*pair)]
+    off_lanes = tuple(graph.connections_off_arrows(built))
+    return StreetTurns(graph, built, comparison.lost, comparison.added, relations, tuple(back), off_lanes)
 
 
 def repair_turns(
@@ -582,24 +601,25 @@ def repair_turns(
     tuple of str
         Sentences on what was repaired, and what still differs.
     """
-    before = after = compare_with_map(extract, folder / name, lefthand=lefthand)
+    graph = StreetGraph(extract, folder / name, lefthand=lefthand)
+    before = after = compare_with_map(graph, graph.built)
     closed = _closable(before)
-    signals = find_signals(before.graph)
+    signals = find_signals(graph)
     if closed or before.lost or signals.nodes:
-        lanes = lanes_of_pairs(before.graph.built.connections)
+        lanes = lanes_of_pairs(graph.built.connections)
         removed = [connection for pair in closed for connection in lanes[pair]]
-        added = [_connection(before.graph, pair) for pair in before.lost]
+        added = [_connection(graph, pair) for pair in before.lost]
         patch_network(folder, name, f"patched.{name}", removed=removed, added=added, flags=flags, signals=signals.nodes)
         (folder / f"patched.{name}").replace(folder / name)
-        after = compare_with_map(extract, folder / name, lefthand=lefthand)
-    return (*_notes(before, after), *_signal_notes(before.graph, signals))
+        after = compare_with_map(graph, BuiltTurns.read(folder / name))
+    return (*_notes(before, after), *_signal_notes(graph, signals))
 
 
 def _closable(turns: StreetTurns) -> list[Pair]:
     """Return the added turns that can be closed: those that a restriction forbids, and others unless an edge would lead
     nowhere, or nothing to it.
     """
-    pairs = turns.graph.built.edge_pairs - {pair for pair in turns.added if turns.relations[pair]}
+    pairs = turns.built.edge_pairs - {pair for pair in turns.added if turns.relations[pair]}
     closed = []
     for pair in turns.added:
         if turns.relations[pair]:

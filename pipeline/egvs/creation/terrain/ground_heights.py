@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from scipy.spatial import KDTree
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core import limits
 from egvs.core.grid import FloatArray, IntArray
 from egvs.creation.map_parts import Terrain
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
 
 LOWEST_M, HIGHEST_M = -1000.0, 9000.0
 """Limits of heights above sea level; -9999, which often stands for unknown heights, is below."""
@@ -90,6 +93,8 @@ class ExtendedTerrain:
 
     @cached_property
     def _vertices(self) -> KDTree:
+        from scipy.spatial import KDTree  # its import takes long, and flat maps need none
+
         return KDTree(self.terrain.vertices_m[:, :2])
 
 
