@@ -97,8 +97,8 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         desk.ok("POST", "/api/run", {})
         assert desk.refused("POST", "/api/run", {})[0] == 409
         assert desk.refused("PATCH", "/api/sites/pole_a", {"z_m": 4})[0] == 409
-        assert next_event(events, "job")["state"] == "runs"
         assert desk.ok("POST", "/api/stop", {})["job"]["state"] == "stopped"
+        assert next_event(events, "job")["state"] == "runs"
         assert desk.refused("POST", "/api/stop", {})[0] == 409
         desk.ok("POST", "/api/run", {})
         desk.wait()

@@ -277,7 +277,7 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
 
 
 def test_broken_map_is_explained(open_page: Callable[..., Any], tmp_path: Path) -> None:
-    (tmp_path / "broken.osm").write_bytes(b"<osm><script>alert(1)</script>")
+    (tmp_path / "broken.osm").write_bytes(b"<osm version='0.6'><script>alert(1)</script>")
     tab = open_page()
     tab.set_input_files("#map-file", tmp_path / "broken.osm")
     message = tab.locator("#message.error")
