@@ -112,6 +112,18 @@ BAD = {
         InputError,
         r"c\.sumocfg: has no net-file",
     ),
+    "configuration names a blank network": (
+        write("c.sumocfg", '<configuration><net-file value=" "/></configuration>'),
+        {"sumocfg": "c.sumocfg"},
+        InputError,
+        r"c\.sumocfg: has no net-file",
+    ),
+    "configuration names two networks": (
+        write("c.sumocfg", '<configuration><net-file value="net.xml, net.xml"/></configuration>'),
+        {"sumocfg": "c.sumocfg"},
+        InputError,
+        r"c\.sumocfg: expected one net-file, got 2",
+    ),
     "configuration names a missing file": (
         write("c.sumocfg", '<configuration><net-file value="gone.xml"/></configuration>'),
         {"sumocfg": "c.sumocfg"},

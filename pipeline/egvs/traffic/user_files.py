@@ -232,8 +232,10 @@ def read_sumocfg(path: Path) -> DemandFiles:
             continue  # has no effect on the traffic
         elif value:
             raise InputError(where, "this SUMO option is not supported", "Remove it; see docs/security.md.")
-    if "net-file" not in paths:
+    if not paths.get("net-file"):
         raise InputError(path, "has no net-file", "Add <net-file value=.../> to its <input>.")
+    if len(paths["net-file"]) > 1:
+        raise InputError(path, f"expected one net-file, got {len(paths['net-file'])}", "Leave the one to simulate.")
     return DemandFiles(paths, options, begin_s)
 
 
