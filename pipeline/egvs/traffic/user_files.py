@@ -201,7 +201,8 @@ def has_vehicles(paths: Iterable[Path]) -> bool:
 
 def sumocfg_network_path(path: Path) -> Path | None:
     """Return the network that a configuration names, if any."""
-    return next((path.parent / value for key, value in _iter_options(path) if key == "net-file" and value), None)
+    values = (value.strip() for option, value in _iter_options(path) if option == "net-file")
+    return next((path.parent / value for value in values if value), None)
 
 
 def read_sumocfg(path: Path) -> DemandFiles:
