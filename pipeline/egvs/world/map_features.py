@@ -246,6 +246,10 @@ class _HeightTags:
         return value
 
 
+LEAST_HEIGHT_M = 0.01
+"""A height below this is a mistake: rounded, it would be none."""
+
+
 def vertical_extent(tags: Mapping[str, str], solid: SolidType, default_m: float) -> VerticalExtent:
     """Return from which height to which an object is solid.
 
@@ -270,7 +274,7 @@ def vertical_extent(tags: Mapping[str, str], solid: SolidType, default_m: float)
         top_m = solid.height_m or default_m
         if base_m is not None and base_m >= top_m:
             top_m = base_m + (solid.thickness_m or LEVEL_M)
-    if base_m is not None and base_m >= top_m:
+    if base_m is not None and base_m > top_m - LEAST_HEIGHT_M:
         height_tags.unreadable.append("base above top")
         base_m = None
     if base_m is None:
@@ -304,9 +308,11 @@ def _levels_m(height_tags: _HeightTags) -> float | None:
     roof_m = height_tags.read("roof:height", parse_length_m)
     if roof_m is None:
         roof_m = LEVEL_M * (height_tags.read("roof:levels", _parse_levels) or 0.0)
-    if not levels and not roof_m:
+    height_m = LEVEL_M * levels + roof_m
+    if height_m < LEAST_HEIGHT_M:
         height_tags.unreadable.append("building:levels")
-    return LEVEL_M * levels + roof_m or None
+        return None
+    return height_m
 
 
 def _default_base_m(solid: SolidType, top_m: float) -> float:
@@ -318,8 +324,9 @@ def _default_base_m(solid: SolidType, top_m: float) -> float:
 
 
 def parse_positive_length_m(text: str) -> float | None:
-    """Return a length in OpenStreetMap's notation in metres; None if it is invalid or 0."""
-    return parse_length_m(text) or None
+    """Return a length in OpenStreetMap's notation in metres; None if it is invalid or below 1 cm."""
+    length_m = parse_length_m(text)
+    return None if length_m is None or length_m < LEAST_HEIGHT_M else length_m
 
 
 def _parse_levels(text: str) -> float | None:
