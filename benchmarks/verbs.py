@@ -97,6 +97,7 @@ VERBS = (
     Verb("run short --out new", saves_results=True),
     Verb("place short --out run --count 2", saves_results=True),
     Verb("explore run --no-browser --port 0", saves_results=True, is_server=True),
+    Verb("desk . --no-browser --port 0", is_server=True),
     Verb("compare run other"),
     Verb("what-if short", saves_results=True),
     Verb("city new town --from small.osm --junctions all"),

@@ -41,7 +41,7 @@ def make_server(folder: Path, scratch: Path, port: int) -> tuple[uvicorn.Server,
 def serve(folder: Path, scratch: Path, listening: socket.socket, announce: Callable[[str], None]) -> None:
     """Serve a folder until Ctrl-C; ``announce`` is called with the address."""
     server, address, _ = make_server(folder, scratch, listening.getsockname()[1])
-    announce(address)
     with contextlib.suppress(KeyboardInterrupt):  # the normal way to stop
+        announce(address)
         server.run(sockets=[listening])
     print()
