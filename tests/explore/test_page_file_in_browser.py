@@ -18,10 +18,11 @@ pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[exp
 from egvs.explore.drawing import HIDDEN_COLOUR, VISIBLE_COLOUR, colour_scale, linear_colours
 from egvs.explore.page_file import write_page_file
 from egvs.explore.settings import open_session
-from tests.explore.test_page_in_browser import CHROMIUM, GRAPHICS, READY_MS
+from tests.chromium import needs_chromium, open_chromium
+from tests.explore.test_page_in_browser import GRAPHICS, READY_MS
 
 pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"),
+    needs_chromium,
     pytest.mark.system,
     pytest.mark.slow,
 ]
@@ -51,13 +52,10 @@ def count_shades(picture: np.ndarray, colour: np.ndarray) -> int:
 
 
 def test_opens_from_disk_without_network(tmp_path: Path) -> None:
-    from playwright.sync_api import sync_playwright
-
     page = write_page_file(open_session(write_mini(tmp_path / "mini"), (), tmp_path / "run"), tmp_path / "page.html")
     errors: list[str] = []
     requests: list[str] = []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=GRAPHICS)
+    with open_chromium(GRAPHICS) as browser:
         context = browser.new_context(
             viewport={"width": 800, "height": 500}, device_scale_factor=0.5, offline=True, color_scheme="dark"
         )
@@ -82,7 +80,6 @@ def test_opens_from_disk_without_network(tmp_path: Path) -> None:
             picture = np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"))
             if count_pixels(picture, VEHICLE_COLOURS) >= MIN_PIXELS:
                 break
-        browser.close()
     assert count_pixels(picture, VEHICLE_COLOURS) >= MIN_PIXELS, "no vehicle has a colour of the legend"
     assert count_shades(picture, WORST_SITE_COLOUR) >= MIN_PIXELS, "the ball of the worst site has another colour"
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50

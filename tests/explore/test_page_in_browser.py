@@ -10,7 +10,6 @@ import functools
 import http.server
 import math
 import re
-import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,13 +22,13 @@ from egvs.explore.page import GIZMO_M, Page
 from egvs.explore.settings import open_session
 from egvs.explore.view_state import SAVED_SITES, Camera
 from egvs.sensors.sites import Pose
+from tests.chromium import needs_chromium, open_chromium
 from tests.conftest import write_mini
 
 viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
 
 from tests.explore.serving import serving  # noqa: E402
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 READY_MS, READY_S = 60_000, 60
 
@@ -40,7 +39,7 @@ CONNECT = """([address, protocol]) => new Promise(done => {
 })"""
 
 pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"),
+    needs_chromium,
     pytest.mark.system,
     pytest.mark.slow,
 ]
@@ -59,12 +58,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """Chromium with software rendering."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=GRAPHICS)
+    with open_chromium(GRAPHICS) as opened:
         yield opened.new_context(viewport={"width": 800, "height": 500}, device_scale_factor=0.5)
-        opened.close()
 
 
 def look(browser: Any, address: str, errors: list[str]) -> Any:

@@ -5,22 +5,19 @@ from __future__ import annotations
 import base64
 import json
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.chromium import needs_chromium, open_chromium
 from tests.report.small_runs import decode_png, render_report, run_to_scores
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.system,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"),
+    needs_chromium,
 ]
 
 
@@ -48,16 +45,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(params=["light", "dark"])
 def browser_page(run: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
     """The report, open in a browser."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with open_chromium() as browser:
         opened = browser.new_page(color_scheme=request.param, viewport={"width": 1200, "height": 900})
         errors: list[str] = []
         opened.on("pageerror", lambda error: errors.append(str(error)))
         opened.goto((run / "report.html").as_uri())
         yield opened
-        browser.close()
         assert errors == []
 
 

@@ -5,7 +5,6 @@ The run has long names, periods, columns of the user, a plan, a validation and a
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,16 +14,15 @@ import pytest
 from egvs.cli.commands import GROUP
 from egvs.core import plugins
 from tests.accessibility import violations
+from tests.chromium import needs_chromium, open_chromium
 from tests.conftest import write_mini
 from tests.installed import needs
 from tests.processes import run_egvs
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.system,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"),
+    needs_chromium,
 ]
 
 SITES = """\
@@ -73,12 +71,8 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with open_chromium() as opened:
         yield opened
-        opened.close()
 
 
 @pytest.fixture(params=[(390, "light"), (390, "dark"), (768, "light"), (1280, "light")], ids=str)

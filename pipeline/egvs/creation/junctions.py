@@ -33,6 +33,7 @@ contains the central island, so that poles stand around it.
 from __future__ import annotations
 
 import html
+import itertools
 import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
@@ -340,7 +341,7 @@ def read_streets(path: Path) -> Streets:
 def _lane_areas(edges: Sequence[Edge]) -> dict[str, BaseGeometry]:
     """Return the area of the lanes of each edge at full width, without pavements."""
     lanes = [
-        [lane for lane in edge.lanes if not lane.is_pavement and (lane.shape_m != lane.shape_m[0]).any()]
+        [lane for lane in edge.lanes if not lane.is_pavement and (lane.shape_m != lane.shape_m[:1]).any()]
         for edge in edges
     ]
     flat = [lane for of_edge in lanes for lane in of_edge]
@@ -349,11 +350,11 @@ def _lane_areas(edges: Sequence[Edge]) -> dict[str, BaseGeometry]:
     lines = shapely.linestrings(
         np.concatenate([np.empty((0, 2)), *points_m]), indices=np.repeat(np.arange(len(flat)), [*map(len, points_m)])
     )
-    strips = np.full((len(edges), max(map(len, lanes))), None, dtype=object)
-    strips[np.arange(strips.shape[1]) < np.array([*map(len, lanes)])[:, None]] = shapely.buffer(
-        lines, half_widths_m, quad_segs=_QUAD_SEGS, cap_style="flat"
-    )
-    return dict(zip([edge.id for edge in edges], shapely.union_all(strips, axis=1), strict=True))
+    strips = iter(shapely.buffer(lines, half_widths_m, quad_segs=_QUAD_SEGS, cap_style="flat"))
+    return {
+        edge.id: shapely.union_all([*itertools.islice(strips, len(of_edge))])
+        for edge, of_edge in zip(edges, lanes, strict=True)
+    }
 
 
 def _make_junction(

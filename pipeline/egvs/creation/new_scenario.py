@@ -504,9 +504,9 @@ def list_junctions(
     """Return the junctions of a road map of which a scenario can be made; nothing is written.
 
     The largest come first; with ``at``, the nearest, at most :data:`MOST_LISTED_NEARBY`. Parameters and errors are
-    those of :func:`read_map_streets`.
+    those of :func:`read_map_roads`.
     """
-    streets = read_map_streets(maps, options, progress, at)
+    streets = read_map_roads(maps, options, progress, at).streets
     progress("lists the junctions", 0, 0)
     listed = [
         ListedJunction(
@@ -520,13 +520,13 @@ def list_junctions(
     return sorted(listed, key=lambda junction: junction.distance_m or 0.0)[:MOST_LISTED_NEARBY]
 
 
-def read_map_streets(
+def read_map_roads(
     maps: Sequence[str | Path],
     options: NewScenarioOptions | None = None,
     progress: ProgressCallback = no_progress,
     at: tuple[float, float] | None = None,
-) -> Streets:
-    """Return the streets of a road map; nothing is written.
+) -> RoadSource:
+    """Return the roads of a map, and who made it; nothing is written.
 
     Parameters
     ----------
@@ -552,7 +552,7 @@ def read_map_streets(
         road_options = RoadOptions(
             options.lefthand, options.walk, bool(files.terrain), at, options.righthand, _LISTED_REACH_M
         )  # fmt: skip
-        return _read_roads(files.roads, road_options).streets
+        return _read_roads(files.roads, road_options)
 
 
 def _open_files(

@@ -513,8 +513,9 @@ class _Phase(NamedTuple):
 def parse_phase_s(key: str, text: str) -> float:
     """Return a duration of a phase of a signal; ValueError where SUMO would reject it."""
     value = float(text)
-    if not (_MIN_PHASE_S if key == "duration" else 0.0) <= value <= MAX_PHASE_S:
-        raise ValueError(f"{key} = {text[:80]!r}: expected seconds, above 0")
+    least_s = _MIN_PHASE_S if key == "duration" else 0.0
+    if not least_s <= value <= MAX_PHASE_S:
+        raise ValueError(f"{key} = {text[:80]!r}: expected seconds, from {least_s:g} to {MAX_PHASE_S:g}")
     return value
 
 

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
 
 from egvs.extensions.city import page
 from tests.accessibility import violations
+from tests.chromium import needs_chromium, open_chromium
 from tests.extensions.city.test_page import make_city, make_plan, make_result
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.system,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"),
+    needs_chromium,
 ]
 
 CUT_CELLS = """() => [...document.querySelectorAll("td, th")]
@@ -25,17 +23,13 @@ CUT_CELLS = """() => [...document.querySelectorAll("td, th")]
 
 @pytest.mark.parametrize("width", [390, 1280])
 def test_cells_of_the_tables_do_not_overlap(tmp_path: Path, width: int) -> None:
-    from playwright.sync_api import sync_playwright
-
     streets = "signalised junction of Bismarckstraße and Donaudampfschifffahrtsgesellschaftsstraße"
     results = (make_result("cluster_1423165998_1698047149", 1, 90.0, streets), make_result("b", 2, 30.0, streets))
     html = page.render_page(make_city(*results), results, (), make_plan("count", (1, 2)))
     (tmp_path / "city.html").write_text(html, encoding="utf-8")
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with open_chromium() as browser:
         opened = browser.new_page(viewport={"width": width, "height": 900})
         opened.goto((tmp_path / "city.html").as_uri())
         assert opened.evaluate(CUT_CELLS) == []
         assert violations(opened) == []
         assert opened.evaluate("document.documentElement.scrollWidth - innerWidth") == 0
-        browser.close()

@@ -11,10 +11,12 @@ import time
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
 
+from tests.creation.overpass_server import overpass_server, recorded_answer
 from tests.extensions.desk.conftest import MAP
 from tests.extensions.desk.serving import Client
 
@@ -38,6 +40,27 @@ def next_event(events: http.client.HTTPResponse, name: str) -> dict[str, object]
         if events.readline().decode().strip() == f"event: {name}":
             content: dict[str, object] = json.loads(events.readline().removeprefix(b"data: "))
             return content
+
+
+def test_a_map_is_downloaded_around_a_point(desk: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+    def respond(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_response(200)
+        handler.end_headers()
+        handler.wfile.write(recorded_answer())
+
+    with overpass_server(respond) as server:
+        monkeypatch.setenv("EGVS_OVERPASS_URL", server.url)
+        desk.ok("POST", "/api/maps/download", {"lat_deg": "52,0", "lon_deg": 10})
+        downloaded = desk.wait()["result"]["map"]
+    assert len(server.queries) == 1
+    desk.ok("POST", f"/api/maps/{downloaded}/read", {})
+    desk.wait()
+    streets = desk.ok("GET", f"/api/maps/{downloaded}")["streets"]
+    assert streets["junctions"][0]["title"] == "signalised junction of East Street and North Street"
+    assert streets["attribution"] == "(c) OpenStreetMap contributors, ODbL"
+    assert desk.refused("POST", "/api/maps/download", {"lat_deg": "91", "lon_deg": 10})[::2] == (422, "lat_deg")
 
 
 def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:

@@ -20,17 +20,17 @@ import pytest
 import egvs
 from egvs.extensions.desk.server import STATIC
 from tests.accessibility import violations
+from tests.chromium import needs_chromium, open_chromium
 from tests.conftest import write_mini
 from tests.extensions.desk.conftest import MAP
 from tests.extensions.desk.serving import serving
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 WAIT_MS, JOB_MS = 20_000, 180_000
 REFUSED = re.compile(r"Failed to load resource: .* status of 4(09|13|15|22) ")
 STEPS = ("Poles", "Traffic", "Run", "Decide", "Take along")
 
 pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"),
+    needs_chromium,
     pytest.mark.system,
     pytest.mark.slow,
 ]
@@ -39,12 +39,8 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """Chromium."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with open_chromium() as opened:
         yield opened
-        opened.close()
 
 
 @pytest.fixture
@@ -206,12 +202,15 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
     tab.mouse.click(*middle(tab.locator(".item.junction:not(.selected) .body").last))
     assert junction.get_attribute("aria-pressed") == "false"
     assert tab.get_by_label("Poles of the map").is_checked()
+    credit = tab.get_by_text("Map data (c) OpenStreetMap contributors, ODbL")
+    assert credit.is_visible()
     assert_accessible(tab)
     junction.click()
     type_into(tab, "Name", "town")
     tab.get_by_role("button", name="Make the scenario").click()
 
     tab.get_by_role("button", name="signal1").click(timeout=JOB_MS)
+    assert credit.is_visible()
     assert "signal mast" in tab.get_by_role("region", name="Pole signal1").inner_text()
     type_into(tab, "Height", "4,5")
     wait_until(tab, lambda: site(tab, "signal1")["z_m"] == 4.5)

@@ -92,8 +92,8 @@ def describe_downloads(run: Path | None, project_name: str) -> dict[str, Any]:
     for each in list_downloads():
         reason = each.reason(commands) if run is not None else "there is no finished run"
         items.append({
-            "id": each.identifier, "title": each.title, "available": not reason, "reason": reason, "ready": False,
+            "id": each.identifier, "title": each.title, "available": not reason, "reason": reason,
         })  # fmt: skip
-    items.append({"id": "scenario", "title": f"Scenario {project_name} as one file", "available": True, "reason": "",
-                  "ready": True})  # fmt: skip
+    items.append({"id": "scenario", "title": f"Scenario {project_name} as one file", "available": True,
+                  "reason": ""})  # fmt: skip
     return {"items": items}

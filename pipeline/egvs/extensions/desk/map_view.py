@@ -28,8 +28,11 @@ MOST_SOLIDS = 4000
 """The nearest solids are drawn."""
 
 
-def describe_streets(streets: Streets) -> dict[str, Any]:
-    """Return the streets of a map and the junctions of which a scenario can be made, the largest first."""
+def describe_streets(streets: Streets, attribution: str) -> dict[str, Any]:
+    """Return the streets of a map and the junctions of which a scenario can be made, the largest first.
+
+    ``attribution`` says who made the map.
+    """
     lanes = list(_lanes(streets.network))
     points_m = [point for lane in lanes for point in lane["points_m"]]
     low, high = np.min(points_m, axis=0), np.max(points_m, axis=0)
@@ -37,7 +40,7 @@ def describe_streets(streets: Streets) -> dict[str, Any]:
         "bounds_m": [*low.tolist(), *high.tolist()],
         "lanes": lanes,
         "junctions": [_describe_junction(streets, each) for each in junctions.distinct_crossings(streets)],
-        "poles": None,
+        "attribution": attribution,
     }
 
 
@@ -47,7 +50,7 @@ def _describe_junction(streets: Streets, junction: StreetJunction) -> dict[str, 
     at = f"{x_m:.1f},{y_m:.1f}" if streets.frame is None else streets.format_position(junction.at_m)
     return {
         "id": junction.id, "title": junction.title, "at": at, "x_m": round(x_m, 2), "y_m": round(y_m, 2),
-        "lat_deg": lat_deg, "lon_deg": lon_deg, "arms": junction.arms, "lanes_in": junction.lanes_in,
+        "lat_deg": lat_deg, "lon_deg": lon_deg, "arms": junction.arms,
         "signalised": junction.signalised, "outline_m": _rings(junction.area)[:1] and _rings(junction.area)[0][0],
     }  # fmt: skip
 
@@ -76,13 +79,11 @@ def describe_scene(inputs: Inputs) -> dict[str, Any]:
         lanes = list(_lanes(network, window))
         nodes = (shapely.Polygon(node.shape_m[:, :2]) for node in network.junctions if len(node.shape_m) > 2)
         areas = [ring for node in nodes if window.intersects(node) for ring in _rings(node)]
-    zone_areas = zones.reported_zones(scenario)
     return {
         "bounds_m": list(window.bounds),
         "lanes": lanes,
         "junctions": [area[0] for area in areas],
         "solids": list(_solids(inputs.built_world[0], window)),
-        "zones": [{"name": name, "outline_m": ring} for name, area in zone_areas.items() for ring in _rings(area)],
         "attribution": "; ".join(read_map_credits(scenario)),
     }
 
@@ -103,7 +104,7 @@ def _solids(world: World, window: BaseGeometry) -> Iterator[dict[str, Any]]:
         if not window.intersects(outline):
             continue
         z_m = triangles_m[faces][:, :, 2]
-        heights = {"height_m": round(float(z_m.max()), 2), "base_m": round(float(z_m.min()), 2)}
+        heights = {"height_m": round(float(z_m.max()), 2)}
         solid = {"name": name, "kind": kind, **heights}
         for ring in _rings(outline):
             outlines.append((outline.distance(window.centroid), {**solid, "outline_m": ring}))

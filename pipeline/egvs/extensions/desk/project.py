@@ -88,7 +88,7 @@ class CsvTable:
         return text.getvalue()
 
     def set(self, row: dict[str, str], column: str, value: str) -> None:
-        """Set a value; the column is added if there is none."""
+        """Set a value, in a new column if need be."""
         if column not in self.columns and value:
             self.columns.append(column)
         row[column] = value
@@ -329,7 +329,7 @@ class Project:
         if name not in self._contents:
             return f"The sites are in {name}, which is no CSV file in the scenario's folder."
         if not set(_POSITION_COLUMNS) <= set(CsvTable.parse(self._contents[name]).columns):
-            return f"{name} has no columns site, x_m and y_m."
+            return f"{name} has no columns site, x_m and y_m: edit it as a file."
         return ""
 
     def _sites_table(self, *, editable: bool = True) -> tuple[CsvTable, dict[str, dict[str, str]]]:
@@ -420,8 +420,8 @@ class Project:
             known = {signal["name"]: signal for signal in self._describe_signals()}
             signal = known.get(str(body.get("name")))
             phases = body.get("phases")
-            if signal is None or not signal["editable"]:
-                raise RefusalError(409, self._problem or (signal or {}).get("reason") or "there is no such signal")
+            if signal is None:
+                raise RefusalError(409, self._problem or "there is no such signal")
             if not isinstance(phases, list) or len(phases) != len(signal["phases"]):
                 raise RefusalError(422, f"expected {len(signal['phases'])} phases", "", "phases")
             document = tomlkit.parse(self._contents[SCENARIO_FILE])
@@ -569,7 +569,7 @@ class Project:
                     "traffic_s": None if settings.frames is None else settings.frames * settings.frame_period_s,
                 },
                 "costs": {
-                    "are_given": scenario.costs.are_given, "pole_cost": scenario.costs.pole,
+                    "pole_cost": scenario.costs.pole,
                     "sensor_cost": scenario.costs.sensor.get(config.sensor),
                 },
                 "run": {"id": self.run_folder.name, **self.run_state()},

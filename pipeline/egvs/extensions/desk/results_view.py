@@ -62,10 +62,8 @@ def describe_ranking(folder: Path) -> dict[str, Any]:
     poles = []
     for rank, pole in enumerate(ranking.poles, start=1):
         best = _describe_site(pole.best, by)
-        behind = by.change(pole.best.score - ranking.sites[0].score) + f" {by.change_unit}" if rank > 1 else ""
-        poles.append({**best, "pole": pole.name, "rank": rank, "mount_text": describe_mount(pole.best),
-                      "behind_text": behind})  # fmt: skip
-    return {"rank_by": by.name, "label": by.head, "unit": "%" if by.is_share else by.unit, "poles": poles,
+        poles.append({**best, "pole": pole.name, "rank": rank, "mount_text": describe_mount(pole.best)})
+    return {"label": by.head, "unit": "%" if by.is_share else by.unit, "poles": poles,
             "sites": sites}  # fmt: skip
 
 
@@ -74,13 +72,12 @@ def _describe_site(site: RankedSite, by: ScoreLabel) -> dict[str, Any]:
     return {
         "rank": site.rank, "site": site.site, "pole": site.pole, "x_m": site.x_m, "y_m": site.y_m, "z_m": site.z_m,
         "yaw_deg": site.yaw_deg, "pitch_deg": site.pitch_deg, "sensor": site.sensor, "score": _finite(site.score),
-        "score_se": site.score_se, "score_text": by.with_unit(site.score, se), "egvs": _finite(site.egvs),
-        "entropy_seen": _finite(site.entropy_seen),
+        "score_text": by.with_unit(site.score, se),
     }  # fmt: skip
 
 
 def describe_plan(folder: Path) -> dict[str, Any] | None:
-    """Return the plan of a run; None if there is none."""
+    """Return the plan of a run; None without one."""
     plan = SensorPlan.read(RunFolder(folder))
     if plan is None:
         return None
@@ -97,7 +94,7 @@ def describe_plan(folder: Path) -> dict[str, Any] | None:
     curve = [
         {
             "count": step.count, "score": _finite(step.score), "score_text": by.with_unit(step.score, step.score_se),
-            "sites": list(step.sites), "cost": step.cost, "certificate": _finite(step.certificate),
+            "sites": list(step.sites), "cost": step.cost,
         }
         for step in plan.curve
     ]  # fmt: skip
@@ -108,7 +105,7 @@ def describe_plan(folder: Path) -> dict[str, Any] | None:
         "requested": {key: plan.request[key] for key in ("count", "budget", "reach") if plan.request.get(key)},
         "label": by.head, "unit": "%" if by.is_share else by.unit, "change_unit": by.change_unit, "sensors": sensors,
         "curve": curve, "score_text": by.with_unit(plan.joint, plan.joint_se), "cost": plan.cost,
-        "certificate": _finite(plan.certificate), "certificate_text": proof, "is_best": plan.is_best,
+        "certificate": _finite(plan.certificate), "certificate_text": proof,
     }  # fmt: skip
 
 

@@ -78,7 +78,7 @@ class Desk:
 
     @property
     def project(self) -> Project:
-        """The open scenario; RefusalError if there is none."""
+        """The open scenario; RefusalError if none is open."""
         if self._project is None:
             raise RefusalError(409, "No scenario is open.", "Open one on the first page.")
         return self._project
@@ -106,7 +106,7 @@ class Desk:
 
     def start(self, _body: Body) -> Answer:
         """Return what the start page lists."""
-        return {**self.workspace.describe(), "max_upload_bytes": MAX_UPLOAD_BYTES, "can_download": True}
+        return {**self.workspace.describe(), "max_upload_bytes": MAX_UPLOAD_BYTES}
 
     def open(self, body: Body) -> Answer:
         """Open a scenario."""

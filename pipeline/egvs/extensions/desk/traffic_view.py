@@ -39,9 +39,9 @@ def describe_movements(scenario: Scenario, network: Network | None) -> dict[str,
         way_out = None if count.to_edge is None else edges[count.to_edge]
         movements.append({
             "index": index, "approach": approach, "turn": movement.turn, "to": movement.way_out,
-            "count_per_h": count.per_hour, "from_m": _nearest_point(edge, x_m, y_m), "via_m": [x_m, y_m],
+            "count_per_h": count.per_hour, "from_m": _nearer_end(edge, x_m, y_m), "via_m": [x_m, y_m],
             "assumed": is_assumed, "kind": count.kind,
-            "to_m": None if way_out is None else _nearest_point(way_out, x_m, y_m),
+            "to_m": None if way_out is None else _nearer_end(way_out, x_m, y_m),
             "problem": problems.get(f"{approach} {movement.turn}".strip(), ""),
         })  # fmt: skip
         lanes = edge.lanes_for(CAR)
@@ -54,8 +54,8 @@ def describe_movements(scenario: Scenario, network: Network | None) -> dict[str,
     return {"movements": movements, "approaches": list(approaches.values()), "counts_total_per_h": total}
 
 
-def _nearest_point(edge: Edge, x_m: float, y_m: float) -> list[float]:
-    """Return the point of the middle line of an edge that is nearest to a point."""
+def _nearer_end(edge: Edge, x_m: float, y_m: float) -> list[float]:
+    """Return the end of the middle line of an edge that is nearer to a point."""
     lanes = [lane.shape_m[:, :2] for lane in edge.lanes if lane.permission.admits(CAR)] or [edge.lanes[0].shape_m]
     ends_m = np.array([[lane[0, :2], lane[-1, :2]] for lane in lanes]).mean(axis=0)
     distance_m = np.hypot(*(ends_m - (x_m, y_m)).T)
@@ -97,7 +97,7 @@ def describe_signals(
             continue
         described.append({
             "name": name, "title": title or name, "file": plan.file, "assumed": ASSUMED_PLANS in scenario.assumed,
-            "editable": True, "reason": "", "offset_s": plan.offset_s, "cycle_s": cycle_s,
+            "cycle_s": cycle_s,
             "phases": list(phases.values()),
         })  # fmt: skip
     return described

@@ -51,11 +51,11 @@ class Progress:
 def list_junctions(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
     """Read the streets of a map, and write them for the page to the file ``out``."""
     from egvs.core import files
-    from egvs.creation.new_scenario import read_map_streets
+    from egvs.creation.new_scenario import read_map_roads
     from egvs.extensions.desk.map_view import describe_streets
 
-    streets = read_map_streets([request["map"]], progress=progress.report)
-    files.write_text(Path(request["out"]), json.dumps(describe_streets(streets)))
+    roads = read_map_roads([request["map"]], progress=progress.report)
+    files.write_text(Path(request["out"]), json.dumps(describe_streets(roads.streets, roads.attribution)))
     return {}
 
 

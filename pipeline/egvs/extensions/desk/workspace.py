@@ -71,7 +71,7 @@ class Workspace:
         self._numbers = itertools.count(1)
 
     def scenario_folder(self, identifier: str) -> Path:
-        """Return the folder of a scenario; RefusalError if there is none of that name."""
+        """Return the folder of a scenario; RefusalError for an unknown name."""
         if identifier == "." and (self.folder / SCENARIO_FILE).is_file():
             return self.folder
         folder = self.folder / identifier
@@ -130,7 +130,7 @@ class Workspace:
     def _describe_scenario(self, name: str, runs: dict[str, dict[str, Any]]) -> dict[str, Any]:
         path = self.folder / name / SCENARIO_FILE
         values: dict[str, Any] = {
-            "id": name, "name": name, "description": "", "modified_s": path.stat().st_mtime, "run": None, "problem": ""
+            "id": name, "name": name, "description": "", "run": None, "problem": ""
         }  # fmt: skip
         try:
             scenario = load(path)
@@ -146,7 +146,7 @@ class Workspace:
         scenario = run.scenario.resolve()
         is_here = scenario.parent == self.folder or scenario == self.folder
         return {
-            "id": f"{RUNS}/{run.folder.name}", "name": run.folder.name, "modified_s": run.last_run_s,
+            "id": f"{RUNS}/{run.folder.name}", "name": run.folder.name,
             "scenario": ("." if scenario == self.folder else scenario.name) if is_here else None,
             "best": best.names[0] if best else None,
             "score_text": SCORE_LABELS[best.rank_by].with_unit(best.score) if best else "",

@@ -46,6 +46,7 @@ export function drawMap(changed) {
   const map = mapView();
   if (drawn !== source) {
     map.setShapes(data.project ? shapesOf(source) : { lanes: lanesOf(source), junctions: source.junctions.map((/** @type {any} */ junction) => junction.outline_m ?? []), solids: [], roi_m: null });
+    map.credit.textContent = source.attribution ? `Map data ${source.attribution}` : "";
     map.fit(data.project ? boxAround() : source.bounds_m);
     drawn = source;
   } else if (changed.size === 1 && (changed.has("job") || changed.has("log"))) return;

@@ -80,6 +80,7 @@ export class MapView {
     this.scaleBar = h("div.scale", { "aria-hidden": "true" }, this.scaleText);
     const button = (/** @type {string} */ text, /** @type {string} */ label, /** @type {() => void} */ action) =>
       h("button", { type: "button", "aria-label": label, title: label, onclick: action }, text);
+    this.credit = h("p.credit");
     const north = h("div.north", { "aria-hidden": "true" }, "N");
     const tools = h("div.maptools", {},
       button("+", "Zoom in", () => this.zoom(1.5)),
@@ -90,7 +91,7 @@ export class MapView {
       tabindex: "0", role: "application", "aria-roledescription": "map", "aria-label": "Map from above",
       "aria-describedby": "map-hint",
     }, this.svg);
-    element.append(this.surface, this.bubble, tools, north, this.scaleBar);
+    element.append(this.surface, this.bubble, tools, north, this.scaleBar, this.credit);
     this.keysRest = debounced(KEYS_REST_MS, () => this.endMove());
     /** @type {[number, number, number, number]|null} */ this.box = null;
     /** @type {(() => void)|null} */ this.onPlace = null;

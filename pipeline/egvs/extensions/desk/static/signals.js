@@ -14,7 +14,7 @@ export function drawSignals() {
 
 /** @param {any} signal */
 function signalCard(signal) {
-  const isLocked = !signal.editable || isBusy();
+  const isLocked = isBusy();
   const cycle = signal.phases.reduce((/** @type {number} */ sum, /** @type {any} */ phase) => sum + phase.green_s + phase.yellow_s + phase.all_red_s, 0);
   return h("section.card", {}, h("h2", {}, "Signals"),
     h("p.quiet", {}, `${/^\d+$/.test(signal.title) ? "Cycle" : `${signal.title}: cycle`} ${readable(cycle)} s.`, signal.assumed && " Assumed: type the real times if you know them.", !signal.editable && ` ${signal.reason}`),

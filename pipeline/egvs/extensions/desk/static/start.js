@@ -26,7 +26,7 @@ function drawLists(panel) {
     h("h1", {}, "Where should the LiDARs of a junction stand?"),
     h("section.card.new", {}, h("h2", {}, "Start with a map"), dropZone(start),
       h("p.quiet", {}, "On ", h("b", {}, "openstreetmap.org"), " choose Export, draw a square of about 700 m around the junction, and save it. Or drop a scenario (.zip) that a colleague sent."),
-      start.can_download && downloadForm()),
+      downloadForm()),
     start.scenarios.length > 0 && h("section.card", {}, h("h2", {}, "Continue"), h("ul.rows", {}, start.scenarios.map(scenarioRow))),
     h("section.card", {}, h("h2", {}, "Try an example"), h("ul.rows", {}, start.shipped.map(exampleRow))),
     h("p.quiet.folder", {}, "Everything is saved in ", h("code", {}, start.folder), "."));
