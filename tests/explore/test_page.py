@@ -370,10 +370,14 @@ def test_opened_link_shows_its_view(page: Page, session: Session) -> None:
     assert opener.open(link).url == f"{page.origin}/?initialCameraPosition=0,-30,40&initialCameraLookAt=0,0,2.5"
     assert page.wait_until_idle(30)
     assert (page.view.site.pose, page.view.layer) == (Pose(10.5, 12, 4), "seen")
-    assert opener.open(f"{page.address}&site=nobody").url == f"{page.origin}/"
+    assert opener.open(f"{page.address}&fixedDpr=0.5").url == f"{page.origin}/?fixedDpr=0.5"
+    assert opener.open(f"{page.address}&fixedDpr=0.5&site=nobody").url == f"{page.origin}/?fixedDpr=0.5"
     assert page.wait_until_idle(30)
     assert "nobody" in page.controls.status.content
     assert page.view.site.pose == Pose(10.5, 12, 4)
+    assert opener.open(f"{page.address}&fixedDpr=x").url == f"{page.origin}/"
+    assert page.wait_until_idle(30)
+    assert "fixedDpr" in page.controls.status.content
 
 
 BAD_VALUES = [

@@ -18,8 +18,8 @@ pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[exp
 from egvs.explore.drawing import HIDDEN_COLOUR, VISIBLE_COLOUR, colour_scale, linear_colours
 from egvs.explore.page_file import write_page_file
 from egvs.explore.settings import open_session
-from tests.chromium import needs_chromium, open_chromium
-from tests.explore.test_page_in_browser import GRAPHICS, READY_MS
+from tests.chromium import SOFTWARE_GRAPHICS, needs_chromium, open_chromium
+from tests.explore.test_page_in_browser import READY_MS
 
 pytestmark = [
     needs_chromium,
@@ -55,7 +55,7 @@ def test_opens_from_disk_without_network(tmp_path: Path) -> None:
     page = write_page_file(open_session(write_mini(tmp_path / "mini"), (), tmp_path / "run"), tmp_path / "page.html")
     errors: list[str] = []
     requests: list[str] = []
-    with open_chromium(GRAPHICS) as browser:
+    with open_chromium(SOFTWARE_GRAPHICS) as browser:
         context = browser.new_context(
             viewport={"width": 800, "height": 500}, device_scale_factor=0.5, offline=True, color_scheme="dark"
         )

@@ -22,14 +22,13 @@ from egvs.explore.page import GIZMO_M, Page
 from egvs.explore.settings import open_session
 from egvs.explore.view_state import SAVED_SITES, Camera
 from egvs.sensors.sites import Pose
-from tests.chromium import needs_chromium, open_chromium
+from tests.chromium import SOFTWARE_GRAPHICS, needs_chromium, open_chromium
 from tests.conftest import write_mini
 
 viser = pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
 
 from tests.explore.serving import serving  # noqa: E402
 
-GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 READY_MS, READY_S = 60_000, 60
 
 CONNECT = """([address, protocol]) => new Promise(done => {
@@ -58,7 +57,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """Chromium with software rendering."""
-    with open_chromium(GRAPHICS) as opened:
+    with open_chromium(SOFTWARE_GRAPHICS) as opened:
         yield opened.new_context(viewport={"width": 800, "height": 500}, device_scale_factor=0.5)
 
 

@@ -316,7 +316,7 @@ FORMATS = {
     "meshes": ("mesh.obj", "mesh.stl", "mesh.ply", "mesh.glb", "mesh.gltf", "new house.off"),
     "GeoPackage, Shapefile, KML": ("new houses.gpkg", "new houses.shp", "new houses.kml", "sites.gpkg", "sites.shp"),
     "GeoParquet": ("new houses.parquet", "sites.parquet"),
-    "GeoTIFF": ("new terrain.tif",),
+    "GeoTIFF; pictures (PNG, JPEG)": ("new terrain.tif",),
     "ASCII grids": ("new terrain.asc", "new surface.asc"),
     "sweeps in `.npz`": ("sweep sweep.npz",),
     "networks, maps and demand for SUMO": ("net.xml", "sumocfg", "add.xml", "new roads.net.xml", "new lanelets.osm"),

@@ -11,6 +11,7 @@ import errno
 import gc
 import io
 import math
+import re
 import shlex
 import socket
 import threading
@@ -49,6 +50,10 @@ GIZMO_M = 6.0
 FREE_MEMORY_EVERY = 32
 """Moves after which unused memory is returned to the system."""
 
+RESOLUTION = "fixedDpr"
+"""viser's parameter for drawn pixels per CSS pixel; a browser that draws without a GPU is fast enough with 0.5."""
+
+_RESOLUTION_VALUE = re.compile(r"[0-4](\.\d{1,3})?")
 _ADD_SENSOR, _RESET_PLAN = "add", "reset"
 _WHERE = "the page"
 """Used in messages about invalid values."""
@@ -299,19 +304,22 @@ class Page:
         self.request(site=self.current_site(self.session.candidates[site.name].site))
 
     def _open_query(self, query: dict[str, str]) -> dict[str, str]:
-        """Request the view of an opened link, and return the query that sets the browser's camera."""
+        """Request the view of an opened link, and return the query that sets the browser's camera and resolution."""
+        passed = {}
+        if _RESOLUTION_VALUE.fullmatch(query.get(RESOLUTION, "")):
+            passed[RESOLUTION] = query.pop(RESOLUTION)
         if not query:
-            return {}
+            return passed
         try:
             view, camera = decode_view(query, self._initial_session, self._initial_view, "the link")
         except InputError as error:
             self._notice = str(error)
             self.request()
-            return {}
+            return passed
         self.request(**vars(view))
         if camera is None:
-            return {}
-        return {
+            return passed
+        return passed | {
             "initialCameraPosition": self._camera_text(camera.from_m),
             "initialCameraLookAt": self._camera_text(camera.at_m),
         }

@@ -24,6 +24,15 @@ def made_town(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def write_periods(town: Path) -> None:
+    """Give the town a morning, with its counts, and an evening with others."""
+    toml, counts = town / "scenario.toml", (town / "counts.csv").read_text()
+    (town / "evening.csv").write_text(counts.replace(",65\n", ",40\n"))
+    text = toml.read_text().replace('counts = "counts.csv"\n', "")
+    table = '\n[[traffic.periods]]\nname = "{}"\ncounts = "{}"\n'
+    toml.write_text(text + table.format("morning", "counts.csv") + table.format("evening", "evening.csv"))
+
+
 @pytest.fixture
 def desk(tmp_path: Path) -> Iterator[Client]:
     """A page over a folder with the scenario ``mini``."""

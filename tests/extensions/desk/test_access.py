@@ -29,7 +29,7 @@ def test_address_with_key_sets_a_cookie_and_hides_the_key(desk: Client) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "/api/state", "/api/events", "/static/main.js", "/api/files/scenario", "/?key=x"]
+    "path", ["/", "/api/state", "/api/events", "/static/main.js", "/api/files/scenario", "/api/aerial", "/?key=x"]
 )
 def test_refuses_without_key(desk: Client, path: str) -> None:
     refusal(*desk.raw("GET", path, headers={"Cookie": ""}))
@@ -136,7 +136,9 @@ def blocks(count: int, sent: list[int]) -> Iterator[bytes]:
 
 
 @pytest.mark.usefixtures("small_limits")
-@pytest.mark.parametrize("path", ["/api/maps?name=a.osm", "/api/import?name=a.zip", "/api/sites"])
+@pytest.mark.parametrize(
+    "path", ["/api/maps?name=a.osm", "/api/import?name=a.zip", "/api/aerial?name=a.tif", "/api/sites"]
+)
 def test_large_requests_are_refused_while_they_arrive(desk: Client, tmp_path: Path, path: str) -> None:
     status, _, body = desk.raw("POST", path, b"x" * 200_000)
     assert (status, "larger than" in json.loads(body)["message"]) == (413, True)

@@ -19,6 +19,7 @@ import pytest
 from tests.creation.overpass_server import overpass_server, recorded_answer
 from tests.extensions.desk.conftest import MAP
 from tests.extensions.desk.serving import Client
+from tests.extensions.desk.test_aerial import middle_of_red, write_picture
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
@@ -70,9 +71,15 @@ def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:
     streets = desk.ok("GET", f"/api/maps/{dropped['id']}")["streets"]
     junction = streets["junctions"][0]
     assert (junction["title"], junction["arms"]) == ("signalised junction of East Street and North Street", 4)
+    picture = write_picture(tmp_path / "aerial.tif", junction["lon_deg"], junction["lat_deg"]).read_bytes()
+    shown = desk.ok("POST", f"/api/maps/{dropped['id']}/aerial?name=aerial.tif", picture)
+    _, _, content = desk.raw("GET", f"/api/maps/{dropped['id']}/aerial")
+    at_m = [junction["x_m"], junction["y_m"]]
+    assert middle_of_red(content, shown["aerial"]["matrix"]) == pytest.approx(at_m, abs=0.5)
     request = {"map": dropped["id"], "name": "town", "at": junction["at"], "poles": "existing"}
     desk.ok("POST", "/api/new", request)
     assert desk.wait()["result"]["notes"]
+    assert desk.project["aerial"]["matrix"] != shown["aerial"]["matrix"]  # in the frame of the scenario
     assert desk.refused("POST", "/api/new", request)[::2] == (409, "name")
 
     desk.ok("POST", "/api/sites", {"x_m": "211,5", "y_m": 211})

@@ -5,6 +5,7 @@ Every test fails on errors in the console. Refusals of the server (422 and the l
 
 from __future__ import annotations
 
+import base64
 import re
 import shutil
 import subprocess
@@ -20,10 +21,11 @@ import pytest
 import egvs
 from egvs.extensions.desk.server import STATIC
 from tests.accessibility import violations
-from tests.chromium import needs_chromium, open_chromium
+from tests.chromium import SOFTWARE_GRAPHICS, needs_chromium, open_chromium
 from tests.conftest import write_mini
-from tests.extensions.desk.conftest import MAP
+from tests.extensions.desk.conftest import MAP, write_periods
 from tests.extensions.desk.serving import serving
+from tests.extensions.desk.test_aerial import write_picture
 
 WAIT_MS, JOB_MS = 20_000, 180_000
 REFUSED = re.compile(r"Failed to load resource: .* status of 4(09|13|15|22) ")
@@ -39,7 +41,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """Chromium."""
-    with open_chromium() as opened:
+    with open_chromium(SOFTWARE_GRAPHICS) as opened:
         yield opened
 
 
@@ -75,7 +77,7 @@ def open_page(browser: Any, folder: Path, tmp_path: Path) -> Iterator[Callable[.
         for context in contexts:
             context.close()
     assert [error for error in errors if not REFUSED.match(error)] == []
-    assert [url for url in requests if not url.startswith((f"http://{client.host}/", "blob:", "data:"))] == []
+    assert [url for url in requests if not url.startswith(("http://127.0.0.1:", "blob:", "data:"))] == []
 
 
 @pytest.fixture
@@ -204,6 +206,9 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
     assert tab.get_by_label("Poles of the map").is_checked()
     credit = tab.get_by_text("Map data (c) OpenStreetMap contributors, ODbL")
     assert credit.is_visible()
+    tab.get_by_text("Aerial picture", exact=True).click()
+    tab.set_input_files("#picture-file", write_picture(tmp_path / "town.tif", 10.0, 52.0))
+    tab.locator(".picture image").wait_for()
     assert_accessible(tab)
     junction.click()
     type_into(tab, "Name", "town")
@@ -211,6 +216,9 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
 
     tab.get_by_role("button", name="signal1").click(timeout=JOB_MS)
     assert credit.is_visible()
+    assert tab.locator(".picture image").get_attribute("href").startswith("/api/aerial?")
+    tab.locator(".maptools").get_by_role("button", name="Aerial picture").click()
+    assert tab.locator(".picture image").count() == 0
     assert "signal mast" in tab.get_by_role("region", name="Pole signal1").inner_text()
     type_into(tab, "Height", "4,5")
     wait_until(tab, lambda: site(tab, "signal1")["z_m"] == 4.5)
@@ -234,10 +242,10 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
     fields = tab.locator(".approach input")
     fields.nth(0).fill("300")
     fields.nth(0).press("Tab")
-    wait_until(tab, lambda: state(tab)["project"]["movements"][0]["count_per_h"] == 300)
+    wait_until(tab, lambda: state(tab)["project"]["counts"][0]["movements"][0]["count_per_h"] == 300)
     fields.nth(1).fill("28,5")
     fields.nth(1).press("Enter")
-    wait_until(tab, lambda: state(tab)["project"]["movements"][1]["count_per_h"] == 28.5)
+    wait_until(tab, lambda: state(tab)["project"]["counts"][0]["movements"][1]["count_per_h"] == 28.5)
     assert_accessible(tab)
 
     tab.get_by_role("button", name="Next: Run").click()
@@ -285,6 +293,23 @@ def test_broken_map_is_explained(open_page: Callable[..., Any], tmp_path: Path) 
     tab.get_by_role("button", name="Close the message").click()
     assert message.count() == 0
     assert tab.get_by_text("Choose a map file").is_visible()
+
+
+def test_picture_of_another_place_is_explained(town: Any, tmp_path: Path) -> None:
+    town.get_by_text("Aerial picture", exact=True).click()
+    town.set_input_files("#picture-file", write_picture(tmp_path / "far.tif", 13.4, 52.5))
+    message = town.locator("#message.error")
+    message.wait_for()
+    assert "far.tif: does not show this junction, but a place 239 km away" in message.inner_text()
+    make = "text => { const data = new DataTransfer(); data.items.add(new File([BYTES], 'here.tif')); return data; }"
+    here = base64.b64encode(write_picture(tmp_path / "here.tif", 10.0, 52.0).read_bytes()).decode()
+    dropped = town.evaluate_handle(make.replace("BYTES", "Uint8Array.from(atob(text), c => c.charCodeAt(0))"), here)
+    town.dispatch_event("#stage", "drop", {"dataTransfer": dropped})
+    town.locator(".picture image").wait_for()
+    assert message.count() == 0
+    town.get_by_role("button", name="Remove the picture").click()
+    wait_until(town, lambda: state(town)["project"]["aerial"] is None)
+    wait_until(town, lambda: town.locator(".picture image").count() == 0)
 
 
 def test_text_of_files_is_never_markup(open_page: Callable[..., Any], folder: Path) -> None:
@@ -383,18 +408,39 @@ def test_plan_that_cannot_be_is_explained(finished: Any) -> None:
     assert "budget" in message.inner_text()
 
 
-def test_signal_times_are_typed_and_checked(town: Any) -> None:
+def test_signal_times_are_typed_at_the_bars(town: Any) -> None:
     go(town, "Traffic")
+    diagram = town.get_by_role("img", name="Cycle of")
+    assert diagram.locator("rect.green").count() == 4
     times = [phase["green_s"] for phase in state(town)["project"]["signals"][0]["phases"]]
     field = town.get_by_label("Green, stage 1", exact=True)
     field.fill("0")
-    field.press("Enter")
     town.get_by_text("The smallest value is 1.").wait_for()
+    field.fill("2")
+    town.get_by_text(re.compile("East Street .*more vehicles than its green can carry")).first.wait_for()
     field.fill("33,5")
+    assert f"Cycle of {33.5 + times[1] + 10:.0f} s" in diagram.get_attribute("aria-label")
     field.press("Enter")
     wait_until(town, lambda: state(town)["project"]["signals"][0]["phases"][0]["green_s"] == 33.5)
+    assert_accessible(town)
     town.keyboard.press("Control+z")
     wait_until(town, lambda: [phase["green_s"] for phase in state(town)["project"]["signals"][0]["phases"]] == times)
+
+
+def test_counts_are_typed_by_period(folder: Path, made_town: Path, open_page: Callable[..., Any]) -> None:
+    write_periods(shutil.copytree(made_town, folder / "town"))
+    tab = open_scenario(open_page(), "town")
+    go(tab, "Traffic")
+    tab.get_by_label("Period").select_option("evening")
+    field = tab.locator(".approach input").first
+    field.fill("99999")
+    tab.get_by_text("More than its").first.wait_for()
+    field.fill("77")
+    field.press("Enter")
+    wait_until(tab, lambda: state(tab)["project"]["counts"][1]["movements"][0]["count_per_h"] == 77)
+    assert tab.get_by_label("Period").input_value() == "evening"
+    assert state(tab)["project"]["counts"][0]["movements"][0]["count_per_h"] != 77
+    assert_accessible(tab)
 
 
 def test_lorry_is_dropped_on_the_map(finished: Any) -> None:
@@ -411,6 +457,15 @@ def test_lorry_is_dropped_on_the_map(finished: Any) -> None:
     assert_accessible(tab)
     tab.get_by_title("Remove lorry1").click()
     wait_until(tab, lambda: state(tab)["project"]["obstacles"] == [])
+
+
+def test_3d_follows_the_chosen_pole(finished: Any) -> None:
+    tab = finished
+    tab.mouse.click(*pixel(tab, "pole_b"))
+    tab.get_by_role("button", name="3D").click()
+    frame = tab.frame_locator("iframe")
+    frame.get_by_text("of 2 by").first.wait_for(timeout=JOB_MS)
+    assert "fixedDpr=0.5" in tab.frames[1].url
 
 
 def test_scenario_is_sent_as_one_file(open_page: Callable[..., Any], folder: Path, tmp_path: Path) -> None:

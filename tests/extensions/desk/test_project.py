@@ -11,6 +11,7 @@ import pytest
 from egvs.extensions.desk.project import CsvTable
 from egvs.extensions.desk.refusals import RefusalError, parse_number
 from egvs.scenario.loading import load
+from tests.extensions.desk.conftest import write_periods
 from tests.extensions.desk.serving import Client
 
 pytestmark = pytest.mark.system  # a junction is made from a map
@@ -53,7 +54,7 @@ def test_shows_poles_of_the_map_first(town: Client) -> None:
         ("signal1", "signal", True),
         ("lamp1", "lamp", True),
     ]
-    assert project["sites_editable"] and project["counts_editable"]
+    assert project["sites_editable"] and not project["counts"][0]["reason"]
     assert 51.99 < project["origin"]["lat_deg"] < 52.01
 
 
@@ -155,11 +156,11 @@ def test_names_stay_text(town: Client) -> None:
 
 
 def test_counts_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
-    before = town.project
+    (before,) = town.project["counts"]
     town.ok("PUT", "/api/counts", {"counts": {"0": "120", "1": "45,5"}})
-    after = town.project
+    (after,) = town.project["counts"]
     assert [each["count_per_h"] for each in after["movements"][:2]] == [120, 45.5]
-    assert after["counts_total_per_h"] == before["counts_total_per_h"] + 120 + 45.5 - 65 - 43
+    assert after["total_per_h"] == before["total_per_h"] + 120 + 45.5 - 65 - 43
     assert [count.per_hour for count in load(tmp_path / "work" / "town").traffic.counts[:2]] == [120, 45.5]
     first = after["movements"][0]
     assert (first["approach"], first["turn"]) == ("East Street (east)", "straight")
@@ -171,9 +172,9 @@ def test_counts_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
 
 
 def test_more_vehicles_than_lanes_carry_are_said_at_once(town: Client) -> None:
-    approach = town.ok("PUT", "/api/counts", {"counts": {"0": "2500"}})["project"]["approaches"][0]
+    approach = town.ok("PUT", "/api/counts", {"counts": {"0": "2500"}})["project"]["counts"][0]["approaches"][0]
     assert approach["in_per_h"] > approach["limit_per_h"]
-    movement = town.project["movements"][0]
+    movement = town.project["counts"][0]["movements"][0]
     assert "exceed" in approach["problem"] + movement["problem"]
 
 
@@ -251,20 +252,35 @@ def test_check_says_what_the_command_says(town: Client) -> None:
 
 def test_signals_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
     (signal,) = town.project["signals"]
-    movements = town.project["movements"]
-    streets = [{movements[index]["approach"] for index in phase["green"]} for phase in signal["phases"]]
+    streets = [{row["approach"] for row in phase["green"]} for phase in signal["phases"]]
     assert streets == [{"East Street (east)", "East Street (west)"}, {"North Street (north)", "North Street (south)"}]
-    assert signal["cycle_s"] == sum(phase["green_s"] + 5 for phase in signal["phases"])
-    phases = [{**signal["phases"][0], "green_s": "32,5"}, {**signal["phases"][1], "yellow_s": 4}]
-    (changed,) = town.ok("PUT", "/api/signals", {"name": signal["name"], "phases": phases})["project"]["signals"]
-    assert [phase["green_s"] for phase in changed["phases"]] == [32.5, signal["phases"][1]["green_s"]]
-    assert {phase["yellow_s"] for phase in changed["phases"]} == {4}
+    assert signal["phases"][0]["green"][0]["turns"] == ["right", "straight", "left"]
+    greens = [phase["green_s"] for phase in signal["phases"]]
+    times = {"name": signal["name"], "green_s": ["32,5", greens[1]], "yellow_s": 4, "all_red_s": signal["all_red_s"]}
+    (changed,) = town.ok("PUT", "/api/signals", times)["project"]["signals"]
+    assert [phase["green_s"] for phase in changed["phases"]] == [32.5, greens[1]]
+    assert (changed["yellow_s"], changed["all_red_s"]) == (4, signal["all_red_s"])
     assert "1,East Street (east),right straight left,32.5\n" in read(tmp_path, "signals.csv")
-    phases[0]["green_s"] = "0"
-    refused = town.refused("PUT", "/api/signals", {"name": signal["name"], "phases": phases})
-    assert refused[::2] == (422, "phases.0.green_s")
-    assert town.refused("PUT", "/api/signals", {"name": signal["name"], "phases": []})[0] == 422
-    assert town.refused("PUT", "/api/signals", {"name": "no", "phases": []})[0] == 409
+    assert town.refused("PUT", "/api/signals", {**times, "green_s": ["0", 30]})[::2] == (422, "green_s.0")
+    assert town.refused("PUT", "/api/signals", {**times, "green_s": []})[0] == 422
+    assert town.refused("PUT", "/api/signals", {**times, "yellow_s": "short"})[::2] == (422, "yellow_s")
+    assert town.refused("PUT", "/api/signals", {**times, "name": "no"})[0] == 409
+
+
+def test_counts_of_a_period_are_in_its_table(town: Client, tmp_path: Path) -> None:
+    write_periods(tmp_path / "work" / "town")
+    morning, evening = town.project["counts"]
+    assert (morning["period"], evening["period"]) == ("morning", "evening")
+    assert morning["total_per_h"] > evening["total_per_h"]
+    before = read(tmp_path, "counts.csv")
+    after = town.ok("PUT", "/api/counts", {"period": "evening", "counts": {"0": "77"}})["project"]["counts"]
+    assert [period["movements"][0]["count_per_h"] for period in after] == [65, 77]
+    assert read(tmp_path, "counts.csv") == before
+    periods = load(tmp_path / "work" / "town").by_period()
+    assert periods["evening"].traffic.counts[0].per_hour == 77
+    assert town.refused("PUT", "/api/counts", {"counts": {"0": "77"}})[0] == 409
+    town.ok("POST", "/api/undo", {})
+    assert town.project["counts"][1] == evening
 
 
 def test_obstacles_are_a_table_of_the_scenario(town: Client, tmp_path: Path) -> None:

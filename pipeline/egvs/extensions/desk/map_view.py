@@ -38,6 +38,7 @@ def describe_streets(streets: Streets, attribution: str) -> dict[str, Any]:
     low, high = np.min(points_m, axis=0), np.max(points_m, axis=0)
     return {
         "bounds_m": [*low.tolist(), *high.tolist()],
+        "frame": None if streets.frame is None else [streets.frame.projection, streets.frame.offset_m],
         "lanes": lanes,
         "junctions": [_describe_junction(streets, each) for each in junctions.distinct_crossings(streets)],
         "attribution": attribution,

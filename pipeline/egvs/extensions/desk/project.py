@@ -26,7 +26,7 @@ from egvs.artefacts.run_folder import RUNS, RunFolder
 from egvs.core import files, limits
 from egvs.core.errors import EgvsError, InputError
 from egvs.core.numbers import number_or_nan
-from egvs.extensions.desk import map_view, obstacles, results_view, traffic_view
+from egvs.extensions.desk import aerial, map_view, obstacles, results_view, traffic_view
 from egvs.extensions.desk.pole_check import PoleCheck, kerb_positions
 from egvs.extensions.desk.refusals import RefusalError, parse_number, require_text
 from egvs.scenario.loading import load
@@ -34,6 +34,7 @@ from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.sensors import site_files, sites
 from egvs.sensors.sensor import CATALOGUE
 from egvs.stages.inputs import Inputs
+from egvs.traffic.network import Network
 from egvs.world import geolocation
 
 Contents = dict[str, str]
@@ -159,13 +160,15 @@ class Project:
         return contents
 
     def _table_names(self) -> list[str]:
-        named = [self._scenario.sites.file or "", self._counts_file()]
+        named = [self._scenario.sites.file or "", *self._counts_files().values()]
         return [name for name in named if _EDITED.fullmatch(name)]
 
-    def _counts_file(self) -> str:
+    def _counts_files(self) -> dict[str, str]:
+        """Return the name of the table of counts by period; that of all other traffic has an empty name."""
         traffic = tomlkit.parse((self.folder / SCENARIO_FILE).read_text(encoding="utf-8")).unwrap().get("traffic", {})
-        name = traffic.get("counts") if isinstance(traffic, dict) else None
-        return name if isinstance(name, str) else ""
+        tables = [traffic] if isinstance(traffic, dict) else []
+        tables += [table for table in tables[:1] for table in table.get("periods", ()) if isinstance(table, dict)]
+        return {str(table.get("name", "")): table["counts"] for table in tables if isinstance(table.get("counts"), str)}
 
     def refresh(self) -> bool:
         """Take over what was edited by hand; return whether anything has changed."""
@@ -389,12 +392,13 @@ class Project:
     # ---- counts and settings
 
     def set_counts(self, body: dict[str, Any]) -> None:
-        """Set vehicles per hour of some movements, by their position in the table."""
+        """Set vehicles per hour of some movements of a period, by their position in the table."""
         with self.lock:
             self.refresh()
-            if reason := self._problem or self._why_no_counts():
+            files = self._counts_files()
+            name = files.get(str(body.get("period", "")), files.get("", ""))
+            if reason := self._problem or self._why_no_counts(name):
                 raise RefusalError(409, reason)
-            name = self._counts_file()
             table, counts = CsvTable.parse(self._contents[name]), body.get("counts")
             if not isinstance(counts, dict):
                 raise RefusalError(422, "expected counts by their index", "", "counts")
@@ -405,46 +409,45 @@ class Project:
                 table.rows[int(index)]["count"] = f"{number:.12g}"
             self._change("counts", {**self._contents, name: table.to_text()})
 
-    def _why_no_counts(self) -> str:
-        if self._scenario.traffic.periods:
-            return "The counts are those of several periods; edit them in the files."
-        name = self._counts_file()
-        if name not in self._contents:
-            return "The scenario has no table of counts."
-        return ""
+    def _why_no_counts(self, name: str) -> str:
+        return "" if name in self._contents else "There is no table of counts in the scenario's folder."
+
+    def _describe_counts(self, network: Network | None) -> list[dict[str, Any]]:
+        files, periods = self._counts_files(), self._scenario.by_period()
+        return [
+            {"period": name, "reason": self._why_no_counts(files.get(name, files.get("", "")))}
+            | traffic_view.describe_movements(period, network)
+            for name, period in periods.items()
+        ]
 
     def set_signals(self, body: dict[str, Any]) -> None:
-        """Set green times of a signal in its table, and its yellow and all-red, which are those of all phases."""
+        """Set the green times of a signal in its table, and yellow and all-red in its plan."""
         with self.lock:
             self.refresh()
-            known = {signal["name"]: signal for signal in self._describe_signals()}
-            signal = known.get(str(body.get("name")))
-            phases = body.get("phases")
+            signal = {each["name"]: each for each in self._describe_signals()}.get(str(body.get("name")))
+            greens = body.get("green_s")
             if signal is None:
                 raise RefusalError(409, self._problem or "there is no such signal")
-            if not isinstance(phases, list) or len(phases) != len(signal["phases"]):
-                raise RefusalError(422, f"expected {len(signal['phases'])} phases", "", "phases")
+            if not isinstance(greens, list) or len(greens) != len(signal["phases"]):
+                raise RefusalError(422, f"expected {len(signal['phases'])} green times", "", "green_s")
             document = tomlkit.parse(self._contents[SCENARIO_FILE])
             plan: Any = document["traffic"]["signals"][signal["name"]]
+            for key in ("yellow_s", "all_red_s"):
+                value = parse_number(body.get(key), key, 0.0, 300.0)
+                if value != signal[key]:
+                    plan[key] = value
             table = CsvTable.parse(self._contents[signal["file"]])
-            for number, (given, present) in enumerate(zip(phases, signal["phases"], strict=True)):
-                for key in ("green_s", "yellow_s", "all_red_s"):
-                    value = parse_number(
-                        given.get(key), f"phases.{number}.{key}", 1.0 if key == "green_s" else 0.0, 300.0
-                    )
-                    if key == "green_s":
-                        for row in table.rows:
-                            if row.get("phase") == present["name"]:
-                                row[key] = f"{value:.12g}"
-                    elif value != present[key]:
-                        plan[key] = value
+            for number, (green_s, phase) in enumerate(zip(greens, signal["phases"], strict=True)):
+                value = parse_number(green_s, f"green_s.{number}", 1.0, 300.0)
+                for row in table.rows:
+                    if row.get("phase") == phase["name"]:
+                        row["green_s"] = f"{value:.12g}"
             after = {**self._contents, signal["file"]: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
-            self._change("signals", after, "phases")
+            self._change("signals", after, "green_s")
 
     def _describe_signals(self) -> list[dict[str, Any]]:
-        movements = traffic_view.describe_movements(self._scenario, self._scene().inputs.network)["movements"]
         tables = {name: CsvTable.parse(text).rows for name, text in self._contents.items() if name.endswith(".csv")}
-        return traffic_view.describe_signals(self._scenario, movements, tables)
+        return traffic_view.describe_signals(self._scenario, tables)
 
     @property
     def obstacles(self) -> list[dict[str, Any]]:
@@ -500,13 +503,21 @@ class Project:
         stamps = [
             (path.name, status.st_size, status.st_mtime_ns)
             for path in sorted(self.folder.iterdir())
-            if path.is_file() and path.name not in self._contents and (status := path.stat())
+            if path.is_file()
+            and path.name not in self._contents
+            and path.stem != aerial.STEM
+            and (status := path.stat())
         ]
         key = hashlib.sha256(repr((texts, stamps)).encode()).hexdigest()[:16]
         with self.lock:
             if self._kept_scene is None or self._kept_scene.key != key:
                 self._kept_scene = _Scene(key, Inputs(scenario))
             return self._kept_scene
+
+    def save_picture(self, picture: aerial.AerialPicture) -> None:
+        """Keep the part of an aerial picture that the map shows; it changes no result, and undo leaves it."""
+        frame = geolocation.scenario_georeference(self._scenario).frame
+        picture.save(self.folder, frame, self.map()["bounds_m"])
 
     def map(self) -> dict[str, Any]:
         """Return the map for the page."""
@@ -541,11 +552,9 @@ class Project:
             scenario, config = self._scenario, self._scenario.sites
             scene = self._scene()
             try:
-                traffic = traffic_view.describe_movements(scenario, scene.inputs.network)
-                traffic["signals"] = self._describe_signals()
-                origin = self._origin()
+                counts, origin = self._describe_counts(scene.inputs.network), self._origin()
             except EgvsError as error:
-                traffic, origin = {**traffic_view.describe_movements(scenario, None), "signals": []}, None
+                counts, origin = self._describe_counts(None), None
                 self._problem = self._problem or str(error)
             settings = scenario.traffic
             return {
@@ -553,7 +562,7 @@ class Project:
                 "assumed": list(scenario.assumed), "notes": self.notes, "problem": self._problem,
                 "files": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in self._contents.items()},
                 "roi": {"center_m": scenario.roi.center_m, "size_m": scenario.roi.size_m}, "origin": origin,
-                "map_key": scene.key,
+                "map_key": scene.key, "aerial": aerial.describe_picture(self.folder),
                 "mounts": {
                     "sensor": config.sensor, "heights_m": list(config.heights_m or ()), "aim": config.aim,
                     "pitch_deg": list(config.pitch_deg) if isinstance(config.pitch_deg, tuple) else [config.pitch_deg],
@@ -561,8 +570,7 @@ class Project:
                 "sensors": self._sensor_names(),
                 "sites_editable": not self._why_no_sites(), "sites_reason": self._why_no_sites(),
                 "sites": self._describe_sites(),
-                **traffic, "obstacles": self.obstacles,
-                "counts_editable": not self._why_no_counts(), "counts_reason": self._why_no_counts(),
+                "counts": counts, "signals": self._describe_signals(), "obstacles": self.obstacles,
                 "settings": {
                     "frames": settings.frames, "frame_period_s": settings.frame_period_s,
                     "warmup_s": settings.warmup_s, "seed": scenario.seed,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import http.client
 import json
 import shutil
 import subprocess
@@ -17,6 +18,7 @@ from collections.abc import AsyncIterator, Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode, urlsplit
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -24,20 +26,22 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from egvs.core.errors import EgvsError
+from egvs.artefacts.run_folder import RunFolder
+from egvs.core.errors import EgvsError, InputError
 from egvs.creation.assumed_traffic import TRAFFIC_LEVELS
-from egvs.extensions.desk import downloads, obstacles, results_view
+from egvs.extensions.desk import aerial, downloads, obstacles, results_view
+from egvs.extensions.desk.aerial import AerialPicture
 from egvs.extensions.desk.events import Events
 from egvs.extensions.desk.jobs import Job, LiveScores
 from egvs.extensions.desk.project import Project
 from egvs.extensions.desk.refusals import RefusalError, parse_number, require_text
 from egvs.extensions.desk.workspace import DroppedMap, Workspace, map_suffixes
+from egvs.results.ranking import Ranking
 
 STATIC = Path(__file__).parent / "static"
 _TYPES = {
     ".html": "text/html; charset=utf-8", ".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8",
-    ".svg": "image/svg+xml", ".png": "image/png", ".woff2": "font/woff2", ".json": "application/json",
-    ".txt": "text/plain; charset=utf-8",
+    ".svg": "image/svg+xml", ".png": "image/png", ".jpg": "image/jpeg",
 }  # fmt: skip
 
 MAX_BODY_BYTES = 1_000_000
@@ -65,14 +69,13 @@ class Desk:
         self._job: Job | None = None
         self._live = LiveScores(self.events.publish)
         self._revision = 0
-        self._three: tuple[Path, subprocess.Popen[str], str] | None = None
+        self._three: tuple[subprocess.Popen[str], str] | None = None
         self._what_if: tuple[str, Answer] | None = None
         self._lock = threading.RLock()
 
     def close(self) -> None:
         """End all processes."""
-        self._live.close()
-        self._close_three()
+        self._close_run()
         if self._job is not None and self._job.is_running:
             self._job.stop()
 
@@ -121,7 +124,7 @@ class Desk:
             named = self._project.scenario.name
             if named != name:
                 self._project.run_folder = self.workspace.run_folder(named)
-            self._live.close()
+            self._close_run()
             self._publish_state()
             return self.state({})
 
@@ -136,7 +139,7 @@ class Desk:
         with self._lock:
             self._refuse_while_running()
             self._project = None
-            self._live.close()
+            self._close_run()
             self._publish_state()
             return self.state({})
 
@@ -199,6 +202,9 @@ class Desk:
 
         def finish(result: Answer) -> Answer:
             self._open_after_job(name, result["notes"])
+            if dropped.picture is not None:
+                with contextlib.suppress(InputError):  # it shows other junctions of the map
+                    self.project.save_picture(dropped.picture)
             return result
 
         request = {
@@ -211,6 +217,36 @@ class Desk:
         folder = self.workspace.scenario_folder(identifier)
         self._project = Project(identifier, folder, self.workspace.run_folder(identifier), notes)
         self._publish_state()
+
+    # ---- aerial pictures
+
+    def add_picture(self, picture: AerialPicture, identifier: str = "") -> Answer:
+        """Take over an aerial picture for a dropped map, or for the open scenario, if the identifier is empty."""
+        folder = picture.path.parent
+        try:
+            if identifier:
+                self._map(identifier).save_picture(picture)
+                return self.show_map({}, identifier)
+            self.project.save_picture(picture)
+        except BaseException:
+            shutil.rmtree(folder)
+            raise
+        shutil.rmtree(folder)
+        self._publish_state()
+        return self.state({})
+
+    def remove_picture(self, _body: Body) -> Answer:
+        """Remove the aerial picture of the open scenario."""
+        aerial.remove_picture(self.project.folder)
+        self._publish_state()
+        return self.state({})
+
+    def picture(self, identifier: str = "") -> Path:
+        """Return the aerial picture of a dropped map, or of the open scenario."""
+        path = aerial.find_picture(self._map(identifier).path.parent if identifier else self.project.folder)
+        if path is None:
+            raise RefusalError(404, "there is no aerial picture")
+        return path
 
     # ---- changes
 
@@ -316,8 +352,7 @@ class Desk:
 
     def run(self, _body: Body) -> Answer:
         """Run all stages; continues a run that was stopped."""
-        self._live.close()
-        self._close_three()
+        self._close_run()
         request = {"scenario": str(self.project.folder), "run": str(self.project.run_folder)}
         return self._start_job("run", "Run", request, self._finish_results)
 
@@ -376,6 +411,13 @@ class Desk:
             raise RefusalError(404, "There is no plan yet.", "Ask for a number of sensors, or give a budget.")
         return {"outdated": self.project.run_state()["plan_outdated"], **plan}
 
+    def _refuse_without_scores(self, *, is_open: bool) -> None:
+        """Refuse where the run is not that of the files; what has it open goes on when poles were moved."""
+        state = self.project.run_state()
+        is_moved = is_open and set(state["changed"]) <= {self.project.sites_file}
+        if state["state"] != "complete" and not is_moved:
+            raise RefusalError(409, "Scores need a run of the present files.", "Run the scenario first.")
+
     def score(self, body: Body) -> Answer:
         """Ask for the score of a moved sensor; the answer is an event.
 
@@ -383,11 +425,7 @@ class Desk:
         """
         with self._lock:
             project = self.project
-            state = project.run_state()
-            if state["state"] != "complete" and not (
-                self._live.is_open and set(state["changed"]) <= {project.sites_file}
-            ):
-                raise RefusalError(409, "Scores need a run of the present files.", "Run the scenario first.")
+            self._refuse_without_scores(is_open=self._live.is_open)
             pose = {key: parse_number(body[key], key) for key in _POSE if body.get(key) not in (None, "")}
             request = {"site": require_text(body, "site"), "pose": pose, "request": body.get("request")}
             opened = {
@@ -439,29 +477,34 @@ class Desk:
         target = self.workspace.scratch / f"{self.project.scenario.name}-{identifier}.zip"
         return self.workspace.pack(run / download.made, target)
 
-    def open_three(self, _body: Body) -> Answer:
-        """Start the explorer of the run, for a frame; return its address."""
-        run = self._finished_run()
+    def open_three(self, body: Body) -> Answer:
+        """Start the explorer of the run for a frame, and let it show a sensor, moved or not; return its address."""
         with self._lock:
-            if self._three is None or self._three[0] != run or self._three[1].poll() is not None:
+            is_open = self._three is not None and self._three[0].poll() is None
+            self._refuse_without_scores(is_open=is_open)
+            if self._three is None or not is_open:
                 self._close_three()
-                words = [sys.executable, "-m", "egvs", "explore", str(run), "--no-browser"]
-                process = subprocess.Popen(
-                    words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-                )
-                assert process.stdout is not None and process.stderr is not None
-                address = process.stdout.readline().partition("  ")[0].strip()
-                if not address.startswith("http://"):
-                    reason = process.stderr.read()[-2000:].strip().rpartition("\n")[2]
-                    process.communicate()
-                    raise RefusalError(422, reason or "the explorer did not start")
-                threading.Thread(target=process.stderr.read, daemon=True).start()
-                self._three = run, process, address
-            return {"address": self._three[2]}
+                self._three = _start_explorer(self.project.run_folder)
+            address = self._three[1]
+        if body.get("site"):
+            ranked = {site.site: site for site in Ranking.read(RunFolder(self.project.run_folder).scores).sites}
+            name = require_text(body, "site")
+            if name not in ranked:
+                raise RefusalError(404, f"the run has no candidate {name[:80]!r}", "", "site")
+            pose = {key: getattr(ranked[name], key) for key in (*_POSE, "roll_deg")}
+            pose |= {key: parse_number(body[key], key) for key in _POSE if body.get(key) not in (None, "")}
+            view = urlencode({"site": name, "pose": ",".join(map(str, pose.values()))}, safe=",")
+            _open_link(f"{address}&{view}")
+        return {"address": address}
+
+    def _close_run(self) -> None:
+        """End what has the run open."""
+        self._live.close()
+        self._close_three()
 
     def _close_three(self) -> None:
         if self._three is not None:
-            process = self._three[1]
+            process = self._three[0]
             self._three = None
             process.kill()
             process.wait()
@@ -470,6 +513,32 @@ class Desk:
                     stream.close()
 
 
+def _start_explorer(run: Path) -> tuple[subprocess.Popen[str], str]:
+    """Start the explorer of a run; return its process and its address."""
+    words = [sys.executable, "-m", "egvs", "explore", str(run), "--no-browser"]
+    process = subprocess.Popen(
+        words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None and process.stderr is not None
+    address = process.stdout.readline().partition("  ")[0].strip()
+    if not address.startswith("http://"):
+        reason = process.stderr.read()[-2000:].strip().rpartition("\n")[2]
+        process.communicate()
+        raise RefusalError(422, reason or "the explorer did not start")
+    threading.Thread(target=process.stderr.read, daemon=True).start()
+    return process, address
+
+
+def _open_link(link: str) -> None:
+    """Open a link to a view, as a browser does that follows no redirection: all pages of the explorer show it."""
+    parts = urlsplit(link)
+    connection = http.client.HTTPConnection(parts.netloc, timeout=_EXPLORER_S)
+    with contextlib.closing(connection):
+        connection.request("GET", f"/?{parts.query}")
+        connection.getresponse()
+
+
+_EXPLORER_S = 30.0
 _POSE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg")
 
 
@@ -545,23 +614,42 @@ def endpoint(call: Call, status: int = 200) -> Callable[[Request], Any]:
     return answer
 
 
+async def upload(
+    desk: Desk, request: Request, take: Callable[[str, Path], Answer], suffixes: tuple[str, ...]
+) -> Response:
+    """Save the body of a request as a file of a known kind, and answer with what a call makes of it."""
+    name = request.query_params.get("name", "")
+    try:
+        path = desk.workspace.begin_upload(name, suffixes)
+        await save_upload(request, path)
+        return JSONResponse(await run_in_threadpool(take, name, path), 201)
+    except RefusalError as error:
+        return _refusal_response(error)
+    except EgvsError as error:
+        return _refusal_response(RefusalError.of(error, "name"))
+
+
+def send_file(find: Callable[..., Path], *, is_attachment: bool = True) -> Callable[[Request], Any]:
+    """Return the function that answers requests with the file that a call finds."""
+
+    async def answer(request: Request) -> Response:
+        try:
+            path = await run_in_threadpool(find, **request.path_params)
+        except RefusalError as error:
+            return _refusal_response(error)
+        kind = "application/octet-stream" if is_attachment else _TYPES[path.suffix]
+        filename = path.name if is_attachment else None
+        return FileResponse(path, filename=filename, media_type=kind, headers={"Cache-Control": "no-store"})
+
+    return answer
+
+
 def make_application(desk: Desk) -> Starlette:
     """Return the application, without the guard."""
 
-    async def upload(request: Request, take: Callable[[str, Path], Answer], suffixes: tuple[str, ...]) -> Response:
-        name = request.query_params.get("name", "")
-        try:
-            path = desk.workspace.begin_upload(name, suffixes)
-            await save_upload(request, path)
-            return JSONResponse(await run_in_threadpool(take, name, path), 201)
-        except RefusalError as error:
-            return _refusal_response(error)
-        except EgvsError as error:
-            return _refusal_response(RefusalError.of(error, "name"))
-
     async def upload_map(request: Request) -> Response:
         suffixes = (*map_suffixes(), ".zip")
-        return await upload(request, lambda name, path: desk.workspace.add_map(name, path).to_json(), suffixes)
+        return await upload(desk, request, lambda name, path: desk.workspace.add_map(name, path).to_json(), suffixes)
 
     async def import_scenario(request: Request) -> Response:
         def take(name: str, path: Path) -> Answer:
@@ -570,19 +658,19 @@ def make_application(desk: Desk) -> Starlette:
             finally:
                 shutil.rmtree(path.parent)
 
-        return await upload(request, take, (".zip",))
+        return await upload(desk, request, take, (".zip",))
+
+    async def upload_picture(request: Request) -> Response:
+        beside = [request.query_params.get(key, "") for key in ("world", "crs")]
+
+        def take(name: str, path: Path) -> Answer:
+            return desk.add_picture(AerialPicture(path, name[:80], *beside), **request.path_params)
+
+        return await upload(desk, request, take, aerial.SUFFIXES)
 
     async def events(_request: Request) -> Response:
         stream = desk.events.stream(desk.first_event())
         return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-store"})
-
-    async def download(request: Request) -> Response:
-        try:
-            path = await run_in_threadpool(desk.file, request.path_params["identifier"])
-        except RefusalError as error:
-            return _refusal_response(error)
-        headers = {"Cache-Control": "no-store"}
-        return FileResponse(path, filename=path.name, media_type="application/octet-stream", headers=headers)
 
     async def static(request: Request) -> Response:
         path = (STATIC / request.path_params.get("name", "index.html")).resolve()
@@ -603,6 +691,10 @@ def make_application(desk: Desk) -> Starlette:
         get("/api/start", endpoint(desk.start)), get("/api/state", endpoint(desk.state)),
         post("/api/open", endpoint(desk.open)), post("/api/copy", endpoint(desk.copy)),
         post("/api/close", endpoint(desk.close_project)), post("/api/maps", upload_map),
+        post("/api/aerial", upload_picture), get("/api/aerial", send_file(desk.picture, is_attachment=False)),
+        post("/api/maps/{identifier}/aerial", upload_picture),
+        get("/api/maps/{identifier}/aerial", send_file(desk.picture, is_attachment=False)),
+        Route("/api/aerial", endpoint(desk.remove_picture), methods=["DELETE"]),
         post("/api/import", import_scenario), post("/api/maps/download", endpoint(desk.download_map, 202)),
         Route("/api/signals", endpoint(desk.set_signals), methods=["PUT"]),
         Route("/api/obstacles", endpoint(desk.set_obstacles), methods=["PUT"]),
@@ -622,7 +714,7 @@ def make_application(desk: Desk) -> Starlette:
         get("/api/plan", endpoint(desk.show_plan)), post("/api/score", endpoint(desk.score)),
         get("/api/downloads", endpoint(desk.downloads)),
         post("/api/downloads/{identifier}", endpoint(desk.make_download, 202)),
-        get("/api/files/{identifier}", download), post("/api/three", endpoint(desk.open_three)),
+        get("/api/files/{identifier}", send_file(desk.file)), post("/api/three", endpoint(desk.open_three)),
     ]  # fmt: skip
     return Starlette(routes=routes, lifespan=lifespan)
 

@@ -18,10 +18,13 @@ from egvs.traffic.network import CAR, Edge, Network
 
 
 def describe_movements(scenario: Scenario, network: Network | None) -> dict[str, Any]:
-    """Return movements and approaches of the counts, in the order of the counts; empty without a network."""
+    """Return movements and approaches of the counts, in the order of the counts; empty without a network.
+
+    Of a scenario with periods, ``scenario`` is that of one of them.
+    """
     counts = scenario.traffic.counts
     if network is None or not counts:
-        return {"movements": [], "approaches": [], "counts_total_per_h": 0}
+        return {"movements": [], "approaches": [], "total_per_h": 0}
     x_m, y_m, _ = scenario.roi.center_m
     names = MovementNames(network, (x_m, y_m), counts)
     edges = {edge.id: edge for edge in network.edges}
@@ -51,7 +54,7 @@ def describe_movements(scenario: Scenario, network: Network | None) -> dict[str,
         })  # fmt: skip
         row["in_per_h"] += count.per_hour
     total = sum(count.per_hour for count in counts)
-    return {"movements": movements, "approaches": list(approaches.values()), "counts_total_per_h": total}
+    return {"movements": movements, "approaches": list(approaches.values()), "total_per_h": total}
 
 
 def _nearer_end(edge: Edge, x_m: float, y_m: float) -> list[float]:
@@ -62,17 +65,13 @@ def _nearer_end(edge: Edge, x_m: float, y_m: float) -> list[float]:
     return [round(value, 2) for value in ends_m[distance_m.argmin()].tolist()]
 
 
-def describe_signals(
-    scenario: Scenario, movements: list[dict[str, Any]], tables: dict[str, list[dict[str, str]]]
-) -> list[dict[str, Any]]:
+def describe_signals(scenario: Scenario, tables: dict[str, list[dict[str, str]]]) -> list[dict[str, Any]]:
     """Return the plans of signals that are in tables.
 
     Parameters
     ----------
     scenario
         The scenario.
-    movements
-        From :func:`describe_movements`.
     tables
         The rows of each table of the scenario, by its file name.
     """
@@ -83,21 +82,13 @@ def describe_signals(
         phases: dict[str, dict[str, Any]] = {}
         for row in rows:
             phase = phases.setdefault(row.get("phase", ""), {
-                "name": row.get("phase", ""), "green_s": number_or_nan(row.get("green_s", "")),
-                "yellow_s": plan.yellow_s, "all_red_s": plan.all_red_s, "green": [],
+                "name": row.get("phase", ""), "green_s": number_or_nan(row.get("green_s", "")), "green": [],
             })  # fmt: skip
-            turns = row.get("movement", "").split()
-            phase["green"] += [
-                movement["index"]
-                for movement in movements
-                if movement["approach"] == row.get("approach") and (movement["turn"] in turns or "all" in turns)
-            ]
-        cycle_s = sum(phase["green_s"] + plan.yellow_s + plan.all_red_s for phase in phases.values())
-        if not math.isfinite(cycle_s) or not phases:
+            phase["green"].append({"approach": row.get("approach", ""), "turns": row.get("movement", "").split()})
+        if not phases or not all(math.isfinite(phase["green_s"]) for phase in phases.values()):
             continue
         described.append({
             "name": name, "title": title or name, "file": plan.file, "assumed": ASSUMED_PLANS in scenario.assumed,
-            "cycle_s": cycle_s,
-            "phases": list(phases.values()),
+            "yellow_s": plan.yellow_s, "all_red_s": plan.all_red_s, "phases": list(phases.values()),
         })  # fmt: skip
     return described

@@ -15,8 +15,10 @@ from egvs.artefacts.run_folder import RUNS
 from egvs.core import readers
 from egvs.core.errors import EgvsError, InputError
 from egvs.creation import map_readers, scenario_files
+from egvs.extensions.desk.aerial import AerialPicture, describe_picture
 from egvs.extensions.desk.refusals import RefusalError
 from egvs.formats.archives import unpack_archives
+from egvs.formats.georeference import WorldFrame
 from egvs.results.labels import SCORE_LABELS
 from egvs.runs import run_list
 from egvs.scenario import shipped
@@ -37,17 +39,27 @@ class DroppedMap:
     path: Path
     state: str = "uploaded"
     message: str = ""
+    picture: AerialPicture | None = None
 
     @property
     def streets(self) -> Path:
         """What was read of it."""
         return self.path.parent / "streets.json"
 
+    def save_picture(self, picture: AerialPicture) -> None:
+        """Keep an aerial picture, and the part of it that the map shows."""
+        streets = json.loads(self.streets.read_text(encoding="utf-8"))
+        frame = None if streets["frame"] is None else WorldFrame(*streets["frame"])
+        picture.save(self.path.parent, frame, streets["bounds_m"])
+        if self.picture is not None:
+            shutil.rmtree(self.picture.path.parent)
+        self.picture = picture
+
     def to_json(self, *, with_streets: bool = False) -> dict[str, Any]:
         """Return what the page shows."""
         values: dict[str, Any] = {
             "id": self.identifier, "name": self.name, "bytes": self.path.stat().st_size, "state": self.state,
-            "message": self.message,
+            "message": self.message, "aerial": describe_picture(self.path.parent),
         }  # fmt: skip
         if with_streets and self.state == "read":
             values["streets"] = json.loads(self.streets.read_text(encoding="utf-8"))

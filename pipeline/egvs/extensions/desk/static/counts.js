@@ -1,17 +1,22 @@
 // The counts: numbers at the arrows of the junction's approaches, and their totals.
 import { bendOf, isDrawn } from "./arrows.js";
 import { byId, h, s, show } from "./dom.js";
-import { numberField } from "./fields.js";
+import { choiceField, numberField } from "./fields.js";
 import { readable } from "./numbers.js";
 import { boxAround, mapView } from "./desk_map.js";
-import { change, data, isBusy } from "./store.js";
-import { drawSignals } from "./signals.js";
+import { change, data, isBusy, update } from "./store.js";
+import { drawSignals, showBars } from "./signals.js";
 
 /** Numbers that are being typed, by the index of their movement. @type {Map<number, number>} */
 const draft = new Map();
 /** What the draft belongs to. @type {any} */
 let drawnProject = null;
 let fitted = "";
+/** Name of the period whose counts are shown. */
+let period = "";
+
+/** Movements and approaches of the period. @returns {any} */
+export const counts = () => data.project.counts.find((/** @type {any} */ each) => each.period === period) ?? data.project.counts[0];
 
 /** @type {Record<string, string>} arrows of a driver who looks up the page */
 const TURNS = {
@@ -22,9 +27,9 @@ const TURNS = {
 /** @param {any} movement */
 const countOf = (movement) => draft.get(movement.index) ?? movement.count_per_h;
 /** @param {string} approach */
-const movementsOf = (approach) => data.project.movements.filter((/** @type {any} */ movement) => movement.approach === approach);
-/** @param {any} approach */
-const sumOf = (approach) => movementsOf(approach.approach).reduce((/** @type {number} */ sum, /** @type {any} */ movement) => sum + countOf(movement), 0);
+const movementsOf = (approach) => counts().movements.filter((/** @type {any} */ movement) => movement.approach === approach);
+/** Vehicles per hour, as typed. @param {any} approach */
+export const sumOf = (approach) => movementsOf(approach.approach).reduce((/** @type {number} */ sum, /** @type {any} */ movement) => sum + countOf(movement), 0);
 
 /** @param {any} approach what is wrong with it, also while numbers are typed */
 function problemOf(approach) {
@@ -37,17 +42,18 @@ function problemOf(approach) {
 /** @param {HTMLElement} panel */
 export function drawCounts(panel) {
   const { project } = data;
+  const { approaches, reason } = counts();
   if (drawnProject !== project) draft.clear();
   drawnProject = project;
   const isAssumed = project.assumed.some((/** @type {string} */ text) => text.startsWith("traffic"));
   show(panel,
     h("h1", {}, "Traffic"),
-    project.counts_editable
+    !reason
       ? h("p.todo", {}, isAssumed ? "These numbers are assumed from the map. Type your counts at the arrows, in vehicles per hour." : "Vehicles per hour, at the arrows.")
-      : h("p.note", {}, project.counts_reason),
-    project.approaches.length > 0 && h("div.table", {}, h("table", {}, h("caption.unseen", {}, "Vehicles per hour by approach"),
+      : h("p.note", {}, reason),
+    approaches.length > 0 && h("div.table", {}, h("table", {}, h("caption.unseen", {}, `Vehicles per hour by approach ${counts().period}`),
       h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "From"), h("th.n", { scope: "col" }, "Lanes"), h("th.n", { scope: "col" }, "Vehicles/h"))),
-      h("tbody", {}, project.approaches.map((/** @type {any} */ approach) => h("tr", {},
+      h("tbody", {}, approaches.map((/** @type {any} */ approach) => h("tr", {},
         h("th", { scope: "row" }, approach.approach, h("small.reason", { "data-problem": approach.approach }, problemOf(approach))),
         h("td.n", {}, approach.lanes), h("td.n", { "data-sum": approach.approach }, readable(sumOf(approach)))))),
       h("tfoot", {}, h("tr", {}, h("th", { scope: "row" }, "All"), h("td"), h("td.n", { "data-sum": "" }, readable(total())))))),
@@ -55,24 +61,26 @@ export function drawCounts(panel) {
 }
 
 function total() {
-  return data.project.movements.reduce((/** @type {number} */ sum, /** @type {any} */ movement) => sum + countOf(movement), 0);
+  return counts().movements.reduce((/** @type {number} */ sum, /** @type {any} */ movement) => sum + countOf(movement), 0);
 }
 
 /** Show totals and problems of what is being typed. */
 function showTotals() {
-  for (const approach of data.project.approaches) {
+  for (const approach of counts().approaches) {
     for (const cell of document.querySelectorAll(`[data-sum="${CSS.escape(approach.approach)}"]`)) cell.textContent = readable(sumOf(approach));
     for (const cell of document.querySelectorAll(`[data-problem="${CSS.escape(approach.approach)}"]`)) cell.textContent = problemOf(approach);
   }
   for (const cell of document.querySelectorAll('[data-sum=""]')) cell.textContent = readable(total());
   placeArrows();
+  showBars();
 }
 
 // ---------------------------------------------------------------- diagram on the map
 
 const arrows = s("svg.arrows", { "aria-hidden": "true" });
 const cards = h("div.cards");
-const diagram = h("div.diagram", {}, arrows, cards);
+const periods = h("div.periods");
+const diagram = h("div.diagram", {}, arrows, periods, cards);
 const sizes = new ResizeObserver(() => place());
 
 export function drawDiagram() {
@@ -84,9 +92,10 @@ export function drawDiagram() {
     return;
   }
   if (!diagram.isConnected) stage.append(diagram);
-  const isLocked = !data.project.counts_editable || isBusy();
+  const isLocked = !!counts().reason || isBusy();
   sizes.disconnect();
-  show(cards, data.project.approaches.map((/** @type {any} */ approach) => approachCard(approach, isLocked)));
+  show(periods, data.project.counts.length > 1 && periodChoice());
+  show(cards, counts().approaches.map((/** @type {any} */ approach) => approachCard(approach, isLocked)));
   for (const card of cards.children) sizes.observe(card); // a message makes a card taller
   const map = mapView();
   map.onPlace = place;
@@ -96,9 +105,18 @@ export function drawDiagram() {
   } else place();
 }
 
+function periodChoice() {
+  const names = data.project.counts.map((/** @type {any} */ each) => each.period);
+  return choiceField({ key: "period", label: "Period", value: counts().period, choices: names.map((/** @type {string} */ name) => [name, name]), send(name) {
+    period = name;
+    draft.clear();
+    update({ project: data.project });
+  } });
+}
+
 /** Space around the junction for the cards. @returns {[number, number, number, number]} */
 function boxOfMovements() {
-  const points = data.project.movements.filter(isDrawn).flatMap((/** @type {any} */ movement) => [movement.from_m, movement.to_m]);
+  const points = counts().movements.filter(isDrawn).flatMap((/** @type {any} */ movement) => [movement.from_m, movement.to_m]);
   if (!points.length) return boxAround();
   const [xs, ys] = [0, 1].map((axis) => points.map((/** @type {number[]} */ point) => point[axis]));
   const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
@@ -115,10 +133,10 @@ function approachCard(approach, isLocked) {
     const row = h("div.count", { title: movement.to ? `${movement.turn} to ${movement.to}` : movement.turn },
       s("svg.turn", { viewBox: "0 0 24 24", "aria-hidden": "true" }, s("path", { d: TURNS[movement.turn.toLowerCase()] ?? TURNS.straight })),
       numberField({
-        key: `count.${movement.index}`, label, hasUnseenLabel: true, value: movement.count_per_h, isDisabled: isLocked,
+        key: `count.${counts().period}.${movement.index}`, label, hasUnseenLabel: true, value: movement.count_per_h, isDisabled: isLocked,
         limits: { min: 0, max: 100000 },
         send(value, refuse) {
-          change("PUT", "counts", { counts: { [movement.index]: value } }, refuse);
+          change("PUT", "counts", { period: counts().period, counts: { [movement.index]: value } }, refuse);
         },
         onInput(value) {
           draft.set(movement.index, value ?? 0);
@@ -151,7 +169,7 @@ function place() {
 /** Draw an arrow for each movement, as wide as its count. */
 function placeArrows() {
   const map = mapView();
-  const movements = data.project.movements.filter(isDrawn);
+  const movements = counts().movements.filter(isDrawn);
   const most = Math.max(1, ...movements.map(countOf));
   arrows.setAttribute("viewBox", `0 0 ${map.width} ${map.height}`);
   const flows = movements.map((/** @type {any} */ movement) => {
@@ -171,7 +189,7 @@ function placeArrows() {
 /** A line from a card to its approach. @param {Element} card */
 function leader(card) {
   const element = /** @type {HTMLElement} */ (card);
-  const approach = data.project.approaches.find((/** @type {any} */ other) => other.approach === element.dataset.approach);
+  const approach = counts().approaches.find((/** @type {any} */ other) => other.approach === element.dataset.approach);
   if (getComputedStyle(element).position !== "absolute" || !approach) return null;
   const [x, y] = mapView().toPixel(approach.at_m);
   const nearest = (/** @type {number} */ at, /** @type {number} */ low, /** @type {number} */ size) => Math.min(Math.max(at, low), low + size);
@@ -183,7 +201,7 @@ function leader(card) {
 function placeCards() {
   const map = mapView();
   const places = /** @type {HTMLElement[]} */ ([...cards.children]).map((card, number) => {
-    const [x, y] = map.toPixel(data.project.approaches[number].at_m);
+    const [x, y] = map.toPixel(counts().approaches[number].at_m);
     const [dx, dy] = [x - map.width / 2, y - map.height / 2];
     const [w, height] = [card.offsetWidth, card.offsetHeight];
     const [roomX, roomY] = [Math.max(1, (map.width - w) / 2 - 12), Math.max(1, (map.height - height) / 2 - 12)];
@@ -212,7 +230,7 @@ function pushApart(places, room) {
   }
   for (const spot of places) {
     spot.x = Math.max(8, Math.min(spot.x, room.width - spot.w - 8));
-    spot.y = Math.max(8, Math.min(spot.y, room.height - spot.h - 8));
+    spot.y = Math.max(8 + periods.offsetTop + periods.offsetHeight, Math.min(spot.y, room.height - spot.h - 8));
   }
   return moved;
 }

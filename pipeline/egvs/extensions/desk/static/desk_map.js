@@ -188,8 +188,8 @@ function refuse(at_m, reason) {
   announce(`Not here: ${reason}`);
 }
 
-/** The score of a dragged pole needs the ranking's name of its best candidate. @param {string} id */
-function candidateOf(id) {
+/** What the ranking calls the best candidate of a pole. @param {string} id @returns {string|null} */
+export function candidateOf(id) {
   const pole = data.project.run.state === "none" ? null : data.ranking?.poles.find((/** @type {any} */ other) => siteOf(other.pole) === id);
   return pole?.site ?? null;
 }

@@ -43,8 +43,8 @@ export function numberField(options) {
     onInput: onInput && ((text) => {
       try {
         onInput(parseNumber(text, limits));
-      } catch {
-        // the text is not complete yet; leaving the field says what is wrong
+      } catch (error) {
+        return error instanceof RangeError ? error.message : ""; // other texts may not be complete yet
       }
     }),
   });
@@ -63,7 +63,7 @@ export function numberField(options) {
  * @param {string} [options.placeholder]
  * @param {boolean} [options.isDisabled]
  * @param {(text: string, refuse: Refuse) => void} options.send
- * @param {(text: string) => void} [options.onInput]
+ * @param {(text: string) => string|void} [options.onInput] returns what is wrong while it is typed
  * @returns {HTMLElement}
  */
 export function textInput({ key, label, labelMore, hasUnseenLabel, text, mode, unit, placeholder, isDisabled, send, onInput }) {
@@ -112,7 +112,7 @@ export function textInput({ key, label, labelMore, hasUnseenLabel, text, mode, u
       mark("");
     }
   });
-  if (onInput) input.addEventListener("input", () => onInput(input.value));
+  if (onInput) input.addEventListener("input", () => mark(onInput(input.value) ?? ""));
   return h("div.field", {},
     h(`label${hasUnseenLabel ? ".unseen" : ""}`, { for: id }, label, labelMore && h("span.unseen", {}, labelMore)),
     h("span.entry", {}, input, unit && h("span.unit", { "aria-hidden": "true" }, unit)),
@@ -174,6 +174,40 @@ export function button(text, onclick, { key, isMain, isDisabled, title, pressed 
     type: "button", onclick, title, disabled: isDisabled, "data-key": key ?? text,
     "aria-pressed": pressed === undefined ? null : String(pressed),
   }, text);
+}
+
+/** Let files be dropped on an element. @param {HTMLElement} element @param {(files: File[]) => void} send */
+export function acceptDrop(element, send) {
+  element.addEventListener("dragover", (event) => {
+    event.preventDefault();
+    element.classList.add("over");
+  });
+  element.addEventListener("dragleave", () => element.classList.remove("over"));
+  element.addEventListener("drop", (event) => {
+    event.preventDefault();
+    element.classList.remove("over");
+    if (event.dataTransfer?.files.length) send([...event.dataTransfer.files]);
+  });
+}
+
+/**
+ * A place for files: choose them, or drop them there.
+ * @param {Object} options
+ * @param {string} options.id
+ * @param {string} options.label
+ * @param {string[]} options.kinds endings of their names
+ * @param {boolean} [options.multiple]
+ * @param {boolean} [options.isDisabled]
+ * @param {(files: File[]) => void} options.send
+ */
+export function dropZone({ id, label, kinds, multiple, isDisabled, send }) {
+  const input = h("input", {
+    id, type: "file", "data-key": id, accept: kinds.join(","), multiple, disabled: isDisabled,
+    onchange: () => input.files.length && send([...input.files]),
+  });
+  const zone = h("div.drop", {}, h("label", { for: id }, h("b", {}, label), " or drop it here"), input);
+  acceptDrop(zone, send);
+  return zone;
 }
 
 export const PAGE_ROWS = 25;

@@ -11,6 +11,8 @@ import { drawRun } from "./run.js";
 import { drawPlan } from "./plan.js";
 import { drawTake } from "./take.js";
 import { drawMap, showScore } from "./desk_map.js";
+import { drawPicture } from "./aerial.js";
+import { drawThree } from "./three.js";
 
 /** Steps that were left for another one. @type {Set<string>} */
 const visited = new Set();
@@ -18,7 +20,7 @@ const visited = new Set();
 /** @type {{id: string, title: string, isOptional?: boolean, draw: (panel: HTMLElement) => void, isDone: (project: any) => boolean}[]} */
 const STEPS = [
   { id: "poles", title: "Poles", isOptional: true, draw: drawPoles, isDone: (project) => project.sites.length > 0 && visited.has("poles") },
-  { id: "traffic", title: "Traffic", isOptional: true, draw: drawCounts, isDone: (project) => project.counts_total_per_h > 0 && visited.has("traffic") },
+  { id: "traffic", title: "Traffic", isOptional: true, draw: drawCounts, isDone: (project) => project.counts.some((/** @type {any} */ period) => period.total_per_h > 0) && visited.has("traffic") },
   { id: "run", title: "Run", draw: drawRun, isDone: (project) => project.run.state === "complete" },
   { id: "plan", title: "Decide", draw: drawPlan, isDone: (project) => project.run.has_plan && !project.run.plan_outdated },
   { id: "take", title: "Take along", draw: drawTake, isDone: () => false },
@@ -94,6 +96,8 @@ function draw(changed) {
     if (next) panel.append(next);
   });
   drawMap(changed);
+  drawPicture();
+  drawThree();
   keepingFocus(byId("stage"), drawDiagram);
 }
 

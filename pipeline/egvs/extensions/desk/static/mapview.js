@@ -63,18 +63,21 @@ export class MapView {
     this.hinted = false;
     this.isFine = false;
     this.isAdding = false;
+    this.pictureHref = "";
     /** @type {Point|null} */ this.cross_m = null;
     /** @type {Point} */ this.center_m = [0, 0];
     this.pxPerM = 4;
     this.width = 600;
     this.height = 400;
     /** @type {Map<number, PointerEvent>} */ this.pointers = new Map();
+    this.picture = s("g.picture");
     this.ground = s("g.ground");
+    this.world = s("g", {}, this.picture, this.ground);
     this.outlines = s("g.outlines");
     this.marks = s("g.marks");
     this.extra = s("g.extra");
     this.cross = s("path.cross", { d: "M-14 0H14M0 -14V14" });
-    this.svg = s("svg", { "aria-hidden": "true" }, this.ground, this.outlines, this.marks, this.extra, this.cross);
+    this.svg = s("svg", { "aria-hidden": "true" }, this.world, this.outlines, this.marks, this.extra, this.cross);
     this.bubble = h("div.bubble", { hidden: true });
     this.scaleText = h("span");
     this.scaleBar = h("div.scale", { "aria-hidden": "true" }, this.scaleText);
@@ -82,7 +85,7 @@ export class MapView {
       h("button", { type: "button", "aria-label": label, title: label, onclick: action }, text);
     this.credit = h("p.credit");
     const north = h("div.north", { "aria-hidden": "true" }, "N");
-    const tools = h("div.maptools", {},
+    this.tools = h("div.maptools", {},
       button("+", "Zoom in", () => this.zoom(1.5)),
       button("−", "Zoom out", () => this.zoom(1 / 1.5)),
       button("⤢", "Show everything", () => this.fit()));
@@ -91,7 +94,7 @@ export class MapView {
       tabindex: "0", role: "application", "aria-roledescription": "map", "aria-label": "Map from above",
       "aria-describedby": "map-hint",
     }, this.svg);
-    element.append(this.surface, this.bubble, tools, north, this.scaleBar, this.credit);
+    element.append(this.surface, this.bubble, this.tools, north, this.scaleBar, this.credit);
     this.keysRest = debounced(KEYS_REST_MS, () => this.endMove());
     /** @type {[number, number, number, number]|null} */ this.box = null;
     /** @type {(() => void)|null} */ this.onPlace = null;
@@ -149,6 +152,18 @@ export class MapView {
       shapes.roi_m && s("path.roi", { d: pathData(shapes.roi_m, true) }));
   }
 
+  /** Show a picture below the map. @param {string} href empty for none @param {number[]} matrix from its pixels to metres */
+  async setPicture(href, matrix) {
+    this.pictureHref = href;
+    show(this.picture);
+    if (!href) return;
+    const image = new Image();
+    image.src = href;
+    await image.decode().catch(() => undefined); // then its width is 0
+    const { naturalWidth: width, naturalHeight: height } = image;
+    if (this.pictureHref === href) show(this.picture, s("image", { href, width, height, transform: `matrix(${matrix.join(" ")})`, preserveAspectRatio: "none" }));
+  }
+
   /** @param {Item[]} items @param {string|null} [selected] */
   setItems(items, selected = this.selected) {
     this.items = items;
@@ -192,7 +207,7 @@ export class MapView {
   place() {
     const { pxPerM: k, width, height } = this;
     const [x, y] = this.center_m;
-    this.ground.setAttribute("transform", `matrix(${k} 0 0 ${-k} ${width / 2 - x * k} ${height / 2 + y * k})`);
+    this.world.setAttribute("transform", `matrix(${k} 0 0 ${-k} ${width / 2 - x * k} ${height / 2 + y * k})`);
     for (const item of this.items) this.placeItem(item.id, item.at_m);
     if (this.moving) this.placeItem(this.moving.id, this.moving.at_m);
     const length = roundLength(Math.min(160, width / 3) / k);

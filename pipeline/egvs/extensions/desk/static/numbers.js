@@ -42,11 +42,11 @@ export function parseNumber(text, limits = {}) {
   return value === 0 ? 0 : value;
 }
 
-/** @param {number} value @param {Limits} limits */
+/** Throws a RangeError: such a number is wrong, however it goes on. @param {number} value @param {Limits} limits */
 function checkLimits(value, { min, max, whole }) {
-  if (whole && !Number.isInteger(value)) throw new Error("Type a whole number.");
-  if (min !== undefined && value < min) throw new Error(`The smallest value is ${fieldText(min)}.`);
-  if (max !== undefined && value > max) throw new Error(`The largest value is ${fieldText(max)}.`);
+  if (whole && !Number.isInteger(value)) throw new RangeError("Type a whole number.");
+  if (min !== undefined && value < min) throw new RangeError(`The smallest value is ${fieldText(min)}.`);
+  if (max !== undefined && value > max) throw new RangeError(`The largest value is ${fieldText(max)}.`);
 }
 
 /** @param {string} text */

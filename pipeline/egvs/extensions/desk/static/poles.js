@@ -1,6 +1,7 @@
 // The poles: a list of the candidates, what can be changed of the chosen one, and what holds for all.
 import { get } from "./api.js";
 import { h, show } from "./dom.js";
+import { pictureCard } from "./aerial.js";
 import { button, checkField, choiceField, numberField, pagedTable, textInput, turnTo } from "./fields.js";
 import { fieldText, parseNumber, readable } from "./numbers.js";
 import { choosePole, kindOf, removePole } from "./desk_map.js";
@@ -45,6 +46,7 @@ export function drawPoles(panel) {
       ],
     }),
     forAll(project, isLocked),
+    pictureCard(),
     assumptions(project));
 }
 

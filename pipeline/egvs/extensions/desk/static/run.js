@@ -1,6 +1,6 @@
 // Running the stages, and the ranking that comes of them.
-import { get, post } from "./api.js";
-import { byId, h, show } from "./dom.js";
+import { get } from "./api.js";
+import { h, show } from "./dom.js";
 import { button, numberField, pagedTable, turnTo } from "./fields.js";
 import { capitalised, duration, readable } from "./numbers.js";
 import { choosePole, siteOf } from "./desk_map.js";
@@ -28,8 +28,7 @@ export function drawRun(panel) {
     h("div.tools", {},
       run.state !== "complete" && button(RUN_TEXTS[run.state], start, { key: "run", isMain: true, isDisabled: !canRun }),
       run.state !== "complete" && button("Check the files", check, { isDisabled: !canRun }),
-      run.state === "complete" && button("Save the report", () => save({ id: "report", title: "Report" }), { isDisabled: isBusy() }),
-      run.state === "complete" && button("3D view", openThree, { isDisabled: isBusy() })),
+      run.state === "complete" && button("Save the report", () => save({ id: "report", title: "Report" }), { isDisabled: isBusy() })),
     job?.kind === "run" && job.state === "failed" && h("p.reason", { role: "alert" }, job.message, job.hint && ` ${job.hint}`),
     checked?.key === filesKey() && problems(checked),
     ranking && drawRanking(ranking));
@@ -95,15 +94,4 @@ function drawRanking(ranking) {
         { title: capitalised(ranking.label), isNumber: true, cell: (pole) => pole.score_text },
       ],
     }));
-}
-
-// ---------------------------------------------------------------- 3D
-
-async function openThree() {
-  const answer = await attempt(() => post("three"));
-  if (!answer) return;
-  const frame = h("iframe", { src: answer.address, title: "3D view of the run" });
-  const box = h("div.three", {}, frame, button("Close 3D", () => box.remove()));
-  byId("stage").append(box);
-  frame.focus();
 }

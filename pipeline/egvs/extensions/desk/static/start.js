@@ -1,9 +1,9 @@
 // The start page: a new scenario from a map, or one that exists.
 import { get, post, request } from "./api.js";
 import { h, show } from "./dom.js";
-import { button, choiceField, numberField, pagedTable, radioField, textInput, turnTo } from "./fields.js";
+import { pictureCard, refuseLarge } from "./aerial.js";
+import { button, choiceField, dropZone, numberField, pagedTable, radioField, textInput, turnTo } from "./fields.js";
 import { shortTitle } from "./junctions.js";
-import { readable } from "./numbers.js";
 import { attempt, change, data, isBusy, runJob, say, update } from "./store.js";
 
 /** What was chosen for the new scenario. */
@@ -24,7 +24,8 @@ function drawLists(panel) {
   const { start } = data;
   show(panel,
     h("h1", {}, "Where should the LiDARs of a junction stand?"),
-    h("section.card.new", {}, h("h2", {}, "Start with a map"), dropZone(start),
+    h("section.card.new", {}, h("h2", {}, "Start with a map"),
+      dropZone({ id: "map-file", label: "Choose a map file", kinds: [...start.map_kinds, ".gz", ".zip"], isDisabled: isBusy(), send: ([file]) => takeFile(file, start) }),
       h("p.quiet", {}, "On ", h("b", {}, "openstreetmap.org"), " choose Export, draw a square of about 700 m around the junction, and save it. Or drop a scenario (.zip) that a colleague sent."),
       downloadForm()),
     start.scenarios.length > 0 && h("section.card", {}, h("h2", {}, "Continue"), h("ul.rows", {}, start.scenarios.map(scenarioRow))),
@@ -32,31 +33,9 @@ function drawLists(panel) {
     h("p.quiet.folder", {}, "Everything is saved in ", h("code", {}, start.folder), "."));
 }
 
-/** @param {any} start */
-function dropZone(start) {
-  const input = h("input", {
-    id: "map-file", type: "file", "data-key": "map-file", accept: [...start.map_kinds, ".gz", ".zip"].join(","), disabled: isBusy(),
-    onchange: () => input.files?.[0] && takeFile(input.files[0], start),
-  });
-  const zone = h("div.drop", {}, h("label", { for: "map-file" }, h("b", {}, "Choose a map file"), " or drop it here"), input);
-  zone.addEventListener("dragover", (/** @type {DragEvent} */ event) => {
-    event.preventDefault();
-    zone.classList.add("over");
-  });
-  zone.addEventListener("dragleave", () => zone.classList.remove("over"));
-  zone.addEventListener("drop", (/** @type {DragEvent} */ event) => {
-    event.preventDefault();
-    zone.classList.remove("over");
-    const file = event.dataTransfer?.files[0];
-    if (file) takeFile(file, start);
-  });
-  return zone;
-}
-
 /** @param {File} file @param {any} start */
 async function takeFile(file, start) {
-  if (file.size > start.max_upload_bytes)
-    return say(`${file.name} has ${readable(file.size / 2 ** 20)} MB; at most ${readable(start.max_upload_bytes / 2 ** 20)} MB are allowed. Choose a smaller part of the map.`, "error");
+  if (refuseLarge(file, start)) return;
   const query = `name=${encodeURIComponent(file.name)}`;
   say(`Loading ${file.name} …`);
   if (file.name.endsWith(".zip")) return change("POST", `import?${query}`, file);
@@ -147,6 +126,7 @@ function drawJunctions(panel) {
         { title: "Signals", cell: (row) => (row.signalised ? "yes" : "no") },
       ],
     })),
+    pictureCard(),
     h("h2", {}, "New scenario"),
     textInput({ key: "name", label: "Name", text: choice.name, send(text) {
       choice.name = text.trim();

@@ -16,6 +16,7 @@ import { byId, h, show } from "./dom.js";
  * @property {any[]|null} suggestions kerb positions that are shown
  * @property {any} keptPlan a plan to compare with
  * @property {any} whatIf
+ * @property {string|null} three address of the 3D view that is shown
  * @property {string} step
  * @property {string|null} selected name of the chosen site or junction
  * @property {boolean} isAdding
@@ -25,7 +26,7 @@ import { byId, h, show } from "./dom.js";
 /** @type {Data} */
 export const data = {
   revision: -1, project: null, job: null, start: null, map: null, upload: null, ranking: null, plan: null,
-  downloads: null, suggestions: null, keptPlan: null, whatIf: null, step: "poles", selected: null, isAdding: false,
+  downloads: null, suggestions: null, keptPlan: null, whatIf: null, three: null, step: "poles", selected: null, isAdding: false,
   log: [],
 };
 
@@ -99,7 +100,7 @@ export function takeState(state) {
   update({ revision: state.revision, project: state.project, job: state.job });
   if (state.job?.log) update({ log: state.job.log });
   if (isOther) resultsKey = "";
-  if (isOther) update({ map: null, ranking: null, plan: null, suggestions: null, selected: null, isAdding: false, keptPlan: null, whatIf: null });
+  if (isOther) update({ map: null, ranking: null, plan: null, suggestions: null, selected: null, isAdding: false, keptPlan: null, whatIf: null, three: null });
   if (state.project) refreshResults();
 }
 
