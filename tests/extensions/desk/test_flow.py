@@ -122,7 +122,8 @@ def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:
 def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_path: Path) -> None:
     desk.ok("POST", "/api/open", {"scenario": "mini"})
     assert desk.refused("GET", "/api/ranking")[0] == 404
-    assert desk.refused("POST", "/api/score", {"site": "pole_a"})[0] == 409
+    for path in ("/api/score", "/api/three"):
+        assert desk.refused("POST", path, {"site": "pole_a"})[0] == 409
     with listening(desk) as events:
         desk.ok("POST", "/api/run", {})
         assert desk.refused("POST", "/api/run", {})[0] == 409

@@ -461,11 +461,23 @@ def test_lorry_is_dropped_on_the_map(finished: Any) -> None:
 
 def test_3d_follows_the_chosen_pole(finished: Any) -> None:
     tab = finished
-    tab.mouse.click(*pixel(tab, "pole_b"))
-    tab.get_by_role("button", name="3D").click()
-    frame = tab.frame_locator("iframe")
-    frame.get_by_text("of 2 by").first.wait_for(timeout=JOB_MS)
+    tab.mouse.click(*pixel(tab, "pole_a"))
+    tab.get_by_role("button", name="3D", exact=True).click()
+    x_m = tab.frame_locator("iframe").get_by_label("x (m)")
+    x_m.wait_for(timeout=JOB_MS)
     assert "fixedDpr=0.5" in tab.frames[1].url
+    wait_until(tab, lambda: float(x_m.input_value()) == site(tab, "pole_a")["x_m"] == 10)
+    assert violations(tab) == []
+    (x, y), (end_x, _) = pixel(tab, "pole_a"), pixel(tab, "pole_b")
+    scale = (end_x - x) / 20.5
+    drag(tab, (x, y), (x - scale, y))
+    wait_until(tab, lambda: float(x_m.input_value()) == site(tab, "pole_a")["x_m"] < 10)
+    moved = site(tab, "pole_a")
+    drag(tab, (x - scale, y), (x + 6 * scale, y + 6 * scale))
+    tab.get_by_text("Not here:").first.wait_for()
+    assert site(tab, "pole_a") == moved and float(x_m.input_value()) == moved["x_m"]
+    tab.get_by_role("button", name="3D", exact=True).click()
+    wait_until(tab, lambda: len(tab.frames) == 1)
 
 
 def test_scenario_is_sent_as_one_file(open_page: Callable[..., Any], folder: Path, tmp_path: Path) -> None:
