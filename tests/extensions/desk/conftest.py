@@ -28,9 +28,8 @@ def write_periods(town: Path) -> None:
     """Give the town a morning, with its counts, and an evening with others."""
     toml, counts = town / "scenario.toml", (town / "counts.csv").read_text()
     (town / "evening.csv").write_text(counts.replace(",65\n", ",40\n"))
-    text = toml.read_text().replace('counts = "counts.csv"\n', "")
     table = '\n[[traffic.periods]]\nname = "{}"\ncounts = "{}"\n'
-    toml.write_text(text + table.format("morning", "counts.csv") + table.format("evening", "evening.csv"))
+    toml.write_text(toml.read_text() + table.format("morning", "counts.csv") + table.format("evening", "evening.csv"))
 
 
 @pytest.fixture

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from egvs.formats.georeference import WorldFrame
+from egvs.scenario.loading import load
+from egvs.world.geolocation import scenario_georeference
 from tests.extensions.desk.serving import Client
 
 pytest.importorskip("rasterio", reason="pictures need rasterio: pip install 'egvs[gis]'")
@@ -37,6 +39,15 @@ def write_picture(path: Path, lon_deg: float, lat_deg: float, crs: str | None = 
     return path
 
 
+def at_junction(tmp_path: Path) -> list[float]:
+    """Longitude and latitude in degrees of the middle of the town."""
+    scenario = load(tmp_path / "work" / "town")
+    frame = scenario_georeference(scenario).frame
+    assert frame is not None
+    (degrees,) = frame.to_degrees(np.array([scenario.roi.center_m[:2]])).tolist()
+    return degrees
+
+
 def red_square() -> np.ndarray:
     """The pixels of a picture, (rows, columns, 3) uint8."""
     pixels = np.full((SIDE, SIDE, 3), 90, dtype=np.uint8)
@@ -55,7 +66,7 @@ def middle_of_red(content: bytes, matrix: list[float]) -> list[float]:
 
 def test_part_around_the_junction_is_kept(town: Client, tmp_path: Path) -> None:
     before = town.project
-    picture = write_picture(tmp_path / "town.tif", before["origin"]["lon_deg"], before["origin"]["lat_deg"])
+    picture = write_picture(tmp_path / "town.tif", *at_junction(tmp_path))
     after = town.ok("POST", "/api/aerial?name=town.tif", picture.read_bytes())["project"]
     assert (after["map_key"], after["undo"]) == (before["map_key"], before["undo"])
     _, headers, content = town.raw("GET", "/api/aerial")
@@ -72,9 +83,7 @@ def test_part_around_the_junction_is_kept(town: Client, tmp_path: Path) -> None:
 
 def test_png_with_a_world_file_lies_in_the_system_of_the_scenario(town: Client, tmp_path: Path) -> None:
     project = town.project
-    lon_deg, lat_deg = project["origin"]["lon_deg"], project["origin"]["lat_deg"]
-    frame = WorldFrame("EPSG:32632")
-    ((x, y),) = frame.from_lon_lat(np.array([[lon_deg, lat_deg]])).tolist()
+    ((x, y),) = WorldFrame("EPSG:32632").from_lon_lat(np.array([at_junction(tmp_path)])).tolist()
     png = io.BytesIO()
     pixels = np.dstack([red_square(), np.full((SIDE, SIDE), 255)]).astype(np.uint8)
     pixels[:100, :, 3] = 0  # nothing is known there

@@ -71,7 +71,7 @@ def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:
     streets = desk.ok("GET", f"/api/maps/{dropped['id']}")["streets"]
     junction = streets["junctions"][0]
     assert (junction["title"], junction["arms"]) == ("signalised junction of East Street and North Street", 4)
-    picture = write_picture(tmp_path / "aerial.tif", junction["lon_deg"], junction["lat_deg"]).read_bytes()
+    picture = write_picture(tmp_path / "aerial.tif", *junction["at"][::-1]).read_bytes()
     shown = desk.ok("POST", f"/api/maps/{dropped['id']}/aerial?name=aerial.tif", picture)
     _, _, content = desk.raw("GET", f"/api/maps/{dropped['id']}/aerial")
     at_m = [junction["x_m"], junction["y_m"]]
@@ -189,8 +189,8 @@ def test_mistakes_with_maps_are_explained(desk: Client) -> None:
     assert "no map has a street lamp" in desk.wait("failed")["message"]
     for body, field in (
         ({"map": "m9", "name": "x"}, ""), ({"map": dropped["id"], "name": "../x"}, "name"),
-        ({"map": dropped["id"], "name": "x", "at": "here"}, "at"),
-        ({"map": dropped["id"], "name": "x", "at": "a,b"}, "at"),
+        ({"map": dropped["id"], "name": "x", "at": [1]}, "at"),
+        ({"map": dropped["id"], "name": "x", "at": ["a", "b"]}, "at"),
         ({"map": dropped["id"], "name": "x", "poles": "all"}, "poles"),
         ({"map": dropped["id"], "name": "x", "traffic": "none"}, "traffic"),
     ):  # fmt: skip

@@ -55,7 +55,6 @@ def test_shows_poles_of_the_map_first(town: Client) -> None:
         ("lamp1", "lamp", True),
     ]
     assert project["sites_editable"] and not project["counts"][0]["reason"]
-    assert 51.99 < project["origin"]["lat_deg"] < 52.01
 
 
 def test_shows_the_map(town: Client) -> None:
@@ -173,7 +172,7 @@ def test_counts_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
 
 def test_more_vehicles_than_lanes_carry_are_said_at_once(town: Client) -> None:
     approach = town.ok("PUT", "/api/counts", {"counts": {"0": "2500"}})["project"]["counts"][0]["approaches"][0]
-    assert approach["in_per_h"] > approach["limit_per_h"]
+    assert approach["limit_per_h"] < 2500
     movement = town.project["counts"][0]["movements"][0]
     assert "exceed" in approach["problem"] + movement["problem"]
 
@@ -278,7 +277,7 @@ def test_counts_of_a_period_are_in_its_table(town: Client, tmp_path: Path) -> No
     assert read(tmp_path, "counts.csv") == before
     periods = load(tmp_path / "work" / "town").by_period()
     assert periods["evening"].traffic.counts[0].per_hour == 77
-    assert town.refused("PUT", "/api/counts", {"counts": {"0": "77"}})[0] == 409
+    assert town.refused("PUT", "/api/counts", {"counts": {"0": "77"}})[::2] == (404, "period")
     town.ok("POST", "/api/undo", {})
     assert town.project["counts"][1] == evening
 

@@ -47,12 +47,13 @@ def describe_streets(streets: Streets, attribution: str) -> dict[str, Any]:
 
 def _describe_junction(streets: Streets, junction: StreetJunction) -> dict[str, Any]:
     x_m, y_m = junction.at_m
-    lon_deg, lat_deg = (None, None) if streets.frame is None else streets.to_degrees([junction.at_m])[0]
-    at = f"{x_m:.1f},{y_m:.1f}" if streets.frame is None else streets.format_position(junction.at_m)
+    at = [round(x_m, 1), round(y_m, 1)]
+    if streets.frame is not None:
+        at = [round(degrees, 5) for degrees in streets.to_degrees([junction.at_m])[0][::-1]]
     return {
         "id": junction.id, "title": junction.title, "at": at, "x_m": round(x_m, 2), "y_m": round(y_m, 2),
-        "lat_deg": lat_deg, "lon_deg": lon_deg, "arms": junction.arms,
-        "signalised": junction.signalised, "outline_m": _rings(junction.area)[:1] and _rings(junction.area)[0][0],
+        "arms": junction.arms, "signalised": junction.signalised,
+        "outline_m": _rings(junction.area)[:1] and _rings(junction.area)[0][0],
     }  # fmt: skip
 
 
@@ -97,18 +98,15 @@ def _solids(world: World, window: BaseGeometry) -> Iterator[dict[str, Any]]:
     order = np.argsort(world.solid_of_face, kind="stable")
     starts = np.searchsorted(world.solid_of_face[order], np.arange(len(world.solids) + 1))
     outlines: list[tuple[float, dict[str, Any]]] = []
-    for number, (name, kind) in enumerate(world.solids):
+    for number, (_, kind) in enumerate(world.solids):
         faces = order[starts[number] : starts[number + 1]]
         if kind == "ground" or not len(faces):
             continue
         outline = _outline(triangles_m[faces], triangles_m[faces[is_drawn[faces]]], kind)
         if not window.intersects(outline):
             continue
-        z_m = triangles_m[faces][:, :, 2]
-        heights = {"height_m": round(float(z_m.max()), 2)}
-        solid = {"name": name, "kind": kind, **heights}
         for ring in _rings(outline):
-            outlines.append((outline.distance(window.centroid), {**solid, "outline_m": ring}))
+            outlines.append((outline.distance(window.centroid), {"kind": kind, "outline_m": ring}))
     outlines.sort(key=lambda each: each[0])
     yield from (solid for _, solid in outlines[:MOST_SOLIDS])
 

@@ -19,7 +19,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tomlkit
 
 from egvs.artefacts.run_folder import RUNS, RunFolder
@@ -164,11 +163,16 @@ class Project:
         return [name for name in named if _EDITED.fullmatch(name)]
 
     def _counts_files(self) -> dict[str, str]:
-        """Return the name of the table of counts by period; that of all other traffic has an empty name."""
+        """Return the file of counts by period, empty where they are no file; other traffic has an empty name."""
         traffic = tomlkit.parse((self.folder / SCENARIO_FILE).read_text(encoding="utf-8")).unwrap().get("traffic", {})
         tables = [traffic] if isinstance(traffic, dict) else []
         tables += [table for table in tables[:1] for table in table.get("periods", ()) if isinstance(table, dict)]
-        return {str(table.get("name", "")): table["counts"] for table in tables if isinstance(table.get("counts"), str)}
+        named = {str(table.get("name", "")): table["counts"] for table in tables if table.get("counts")}
+        return {period: name if isinstance(name, str) else "" for period, name in named.items()}
+
+    def _counts_file(self, period: str) -> str:
+        files = self._counts_files()
+        return files.get(period, files.get("", ""))
 
     def refresh(self) -> bool:
         """Take over what was edited by hand; return whether anything has changed."""
@@ -395,8 +399,10 @@ class Project:
         """Set vehicles per hour of some movements of a period, by their position in the table."""
         with self.lock:
             self.refresh()
-            files = self._counts_files()
-            name = files.get(str(body.get("period", "")), files.get("", ""))
+            period = str(body.get("period", ""))
+            if period not in self._scenario.by_period():
+                raise RefusalError(404, f"there is no period {period[:40]!r}", "", "period")
+            name = self._counts_file(period)
             if reason := self._problem or self._why_no_counts(name):
                 raise RefusalError(409, reason)
             table, counts = CsvTable.parse(self._contents[name]), body.get("counts")
@@ -413,11 +419,10 @@ class Project:
         return "" if name in self._contents else "There is no table of counts in the scenario's folder."
 
     def _describe_counts(self, network: Network | None) -> list[dict[str, Any]]:
-        files, periods = self._counts_files(), self._scenario.by_period()
         return [
-            {"period": name, "reason": self._why_no_counts(files.get(name, files.get("", "")))}
+            {"period": name, "reason": self._why_no_counts(self._counts_file(name) if period.traffic.counts else "")}
             | traffic_view.describe_movements(period, network)
-            for name, period in periods.items()
+            for name, period in self._scenario.by_period().items()
         ]
 
     def set_signals(self, body: dict[str, Any]) -> None:
@@ -552,16 +557,16 @@ class Project:
             scenario, config = self._scenario, self._scenario.sites
             scene = self._scene()
             try:
-                counts, origin = self._describe_counts(scene.inputs.network), self._origin()
+                counts = self._describe_counts(scene.inputs.network)
             except EgvsError as error:
-                counts, origin = self._describe_counts(None), None
+                counts = self._describe_counts(None)
                 self._problem = self._problem or str(error)
             settings = scenario.traffic
             return {
                 "id": self.identifier, "name": scenario.name, "title": scenario.description or scenario.name,
                 "assumed": list(scenario.assumed), "notes": self.notes, "problem": self._problem,
                 "files": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in self._contents.items()},
-                "roi": {"center_m": scenario.roi.center_m, "size_m": scenario.roi.size_m}, "origin": origin,
+                "roi": {"center_m": scenario.roi.center_m, "size_m": scenario.roi.size_m},
                 "map_key": scene.key, "aerial": aerial.describe_picture(self.folder),
                 "mounts": {
                     "sensor": config.sensor, "heights_m": list(config.heights_m or ()), "aim": config.aim,
@@ -573,7 +578,6 @@ class Project:
                 "counts": counts, "signals": self._describe_signals(), "obstacles": self.obstacles,
                 "settings": {
                     "frames": settings.frames, "frame_period_s": settings.frame_period_s,
-                    "warmup_s": settings.warmup_s, "seed": scenario.seed,
                     "traffic_s": None if settings.frames is None else settings.frames * settings.frame_period_s,
                 },
                 "costs": {
@@ -584,13 +588,6 @@ class Project:
                 "undo": self._undo[-1].label if self._undo else None,
                 "redo": self._redo[-1].label if self._redo else None,
             }  # fmt: skip
-
-    def _origin(self) -> dict[str, float] | None:
-        frame = geolocation.scenario_georeference(self._scenario).frame
-        if frame is None:
-            return None
-        ((lon_deg, lat_deg),) = frame.to_degrees(np.array([self._scenario.roi.center_m[:2]])).tolist()
-        return {"lat_deg": lat_deg, "lon_deg": lon_deg}
 
     def _describe_sites(self) -> list[dict[str, Any]]:
         placement, existing = self._scenario.placement, self._scenario.sites.existing_poles

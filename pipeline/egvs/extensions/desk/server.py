@@ -186,14 +186,11 @@ class Desk:
         dropped = self._map(str(body.get("map")))
         name = require_text(body, "name")
         folder = self.workspace.new_folder(name)
-        at = None
-        if body.get("at") is not None:
-            parts = str(body["at"]).split(",")
-            if len(parts) != 2:
+        at = body.get("at")
+        if at is not None:
+            if not isinstance(at, list) or len(at) != 2:
                 raise RefusalError(422, "expected two numbers", "Choose a junction.", "at")
-            at = [parse_number(float(part), "at") for part in parts if _is_float(part)]
-            if len(at) != 2:
-                raise RefusalError(422, "expected two numbers", "Choose a junction.", "at")
+            at = [parse_number(part, "at") for part in at]
         poles, traffic = body.get("poles", "existing"), body.get("traffic", "medium")
         if poles not in ("existing", "kerbs"):
             raise RefusalError(422, "expected existing or kerbs", "", "poles")
@@ -205,6 +202,7 @@ class Desk:
             if dropped.picture is not None:
                 with contextlib.suppress(InputError):  # it shows other junctions of the map
                     self.project.save_picture(dropped.picture)
+                    self._publish_state()
             return result
 
         request = {
@@ -542,14 +540,6 @@ _EXPLORER_S = 30.0
 _POSE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg")
 
 
-def _is_float(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 # ---- HTTP
 
 
@@ -587,7 +577,15 @@ async def save_upload(request: Request, path: Path) -> None:
         raise
 
 
-def _refusal_response(error: RefusalError) -> Response:
+_REFUSALS = (RefusalError, EgvsError, OSError)
+
+
+def _refusal_response(error: Exception, field: str = "") -> Response:
+    if isinstance(error, EgvsError):
+        error = RefusalError.of(error, field)
+    elif isinstance(error, OSError):  # a file was removed, or the disk is full
+        error = RefusalError(409, f"{error.filename or 'a file'}: {error.strerror}")
+    assert isinstance(error, RefusalError)
     close = {"Connection": "close"} if error.status == 413 else None  # the rest of the body is not read
     return JSONResponse(error.content, error.status, headers=close)
 
@@ -602,12 +600,8 @@ def endpoint(call: Call, status: int = 200) -> Callable[[Request], Any]:
         try:
             body = await read_body(request) if request.method != "GET" else {}
             content = await run_in_threadpool(call, body, **request.path_params)
-        except RefusalError as error:
+        except _REFUSALS as error:
             return _refusal_response(error)
-        except EgvsError as error:
-            return _refusal_response(RefusalError.of(error))
-        except OSError as error:  # a file was removed, or the disk is full
-            return _refusal_response(RefusalError(409, f"{error.filename or 'a file'}: {error.strerror}"))
         is_job = status == 202 and "job" in content
         return JSONResponse(content, 202 if is_job else 200, headers={"Cache-Control": "no-store"})
 
@@ -623,10 +617,8 @@ async def upload(
         path = desk.workspace.begin_upload(name, suffixes)
         await save_upload(request, path)
         return JSONResponse(await run_in_threadpool(take, name, path), 201)
-    except RefusalError as error:
-        return _refusal_response(error)
-    except EgvsError as error:
-        return _refusal_response(RefusalError.of(error, "name"))
+    except _REFUSALS as error:
+        return _refusal_response(error, "name")
 
 
 def send_file(find: Callable[..., Path], *, is_attachment: bool = True) -> Callable[[Request], Any]:
@@ -635,7 +627,7 @@ def send_file(find: Callable[..., Path], *, is_attachment: bool = True) -> Calla
     async def answer(request: Request) -> Response:
         try:
             path = await run_in_threadpool(find, **request.path_params)
-        except RefusalError as error:
+        except _REFUSALS as error:
             return _refusal_response(error)
         kind = "application/octet-stream" if is_attachment else _TYPES[path.suffix]
         filename = path.name if is_attachment else None

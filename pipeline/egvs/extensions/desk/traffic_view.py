@@ -32,7 +32,6 @@ def describe_movements(scenario: Scenario, network: Network | None) -> dict[str,
         place: f"{per_h:,.0f} vehicles an hour exceed what {lanes} lanes can carry, {lanes * capacity.LANE_PER_H:,.0f}"
         for place, per_h, lanes in capacity.find_excess(network, names, counts)
     }
-    is_assumed = any(text.startswith("traffic") for text in scenario.assumed)
     movements = []
     approaches: dict[str, dict[str, Any]] = {}
     for index, count in enumerate(counts):
@@ -43,16 +42,14 @@ def describe_movements(scenario: Scenario, network: Network | None) -> dict[str,
         movements.append({
             "index": index, "approach": approach, "turn": movement.turn, "to": movement.way_out,
             "count_per_h": count.per_hour, "from_m": _nearer_end(edge, x_m, y_m), "via_m": [x_m, y_m],
-            "assumed": is_assumed, "kind": count.kind,
             "to_m": None if way_out is None else _nearer_end(way_out, x_m, y_m),
             "problem": problems.get(f"{approach} {movement.turn}".strip(), ""),
         })  # fmt: skip
         lanes = edge.lanes_for(CAR)
-        row = approaches.setdefault(approach, {
-            "approach": approach, "at_m": movements[-1]["from_m"], "in_per_h": 0.0, "lanes": lanes,
+        approaches.setdefault(approach, {
+            "approach": approach, "at_m": movements[-1]["from_m"], "lanes": lanes,
             "limit_per_h": lanes * capacity.LANE_PER_H, "problem": problems.get(approach, ""),
         })  # fmt: skip
-        row["in_per_h"] += count.per_hour
     total = sum(count.per_hour for count in counts)
     return {"movements": movements, "approaches": list(approaches.values()), "total_per_h": total}
 

@@ -58,8 +58,8 @@ class DroppedMap:
     def to_json(self, *, with_streets: bool = False) -> dict[str, Any]:
         """Return what the page shows."""
         values: dict[str, Any] = {
-            "id": self.identifier, "name": self.name, "bytes": self.path.stat().st_size, "state": self.state,
-            "message": self.message, "aerial": describe_picture(self.path.parent),
+            "id": self.identifier, "name": self.name, "state": self.state, "message": self.message,
+            "aerial": describe_picture(self.path.parent),
         }  # fmt: skip
         if with_streets and self.state == "read":
             values["streets"] = json.loads(self.streets.read_text(encoding="utf-8"))
