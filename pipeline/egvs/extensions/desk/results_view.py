@@ -7,19 +7,27 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
 from egvs.core.wording import format_percent
+from egvs.placement import problem_builder
 from egvs.results.labels import ScoreLabel
 from egvs.results.plans import SensorPlan
 from egvs.results.ranking import RankedSite, Ranking, describe_mount
 from egvs.runs import run_sources
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import PlacementConfig
+from egvs.sensors import sites
 
 _NO_SCORES = ("placement", "costs", "what_if")
 """Beginnings of the keys of settings on which no score depends."""
+
+
+MOST_SENSORS = 12
+"""Sensors of the dearest plan that a budget is offered for."""
 
 
 def describe_run(folder: Path, scenario: Scenario) -> dict[str, Any]:
@@ -54,6 +62,22 @@ def _placement_rules(placement: Mapping[str, Any]) -> dict[str, Any]:
     return config.model_dump(exclude={"refine"})
 
 
+def describe_costs(scenario: Scenario) -> dict[str, Any]:
+    """Return what is paid for poles and sensors, and for the cheapest and the dearest plan; None where unknown."""
+    costs: dict[str, Any] = {"pole_cost": scenario.costs.pole, "sensor_costs": {}, "least": None, "most": None}
+    try:
+        candidates = sites.candidate_sites(scenario)
+        costs["sensor_costs"] = {site.sensor: scenario.costs.sensor.get(site.sensor) for site in candidates}
+        rules = problem_builder.rules_from_config(scenario, candidates)
+    except InputError:  # such as a cost that is not given
+        return costs
+    paid = np.where(rules.excluded, 0.0, rules.cost)
+    if paid.any():
+        of_poles = [paid[rules.pole == pole].max() for pole in np.unique(rules.pole)]
+        costs |= {"least": float(paid[paid > 0.0].min()), "most": float(sum(sorted(of_poles)[-MOST_SENSORS:]))}
+    return costs
+
+
 def describe_ranking(folder: Path) -> dict[str, Any]:
     """Return the ranking of a run."""
     ranking = Ranking.read(RunFolder(folder).scores)
@@ -76,8 +100,8 @@ def _describe_site(site: RankedSite, by: ScoreLabel) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def describe_plan(folder: Path) -> dict[str, Any] | None:
-    """Return the plan of a run; None without one."""
+def describe_plan(folder: Path, adds: Mapping[str, list[str]]) -> dict[str, Any] | None:
+    """Return the plan of a run, with sentences on what each sensor ``adds``, by its site; None without a plan."""
     plan = SensorPlan.read(RunFolder(folder))
     if plan is None:
         return None
@@ -88,6 +112,7 @@ def describe_plan(folder: Path) -> dict[str, Any] | None:
             "z_m": each.z_m, "yaw_deg": each.yaw_deg, "pitch_deg": each.pitch_deg, "sensor": each.sensor,
             "gain_text": by.change(each.gain, each.gain_se), "score_text": by.with_unit(each.score, each.score_se),
             "loss_text": by.change(each.loss), "cost": each.cost, "forced": each.forced,
+            "adds_text": adds.get(each.site, []),
         }
         for each in plan.sensors
     ]  # fmt: skip
