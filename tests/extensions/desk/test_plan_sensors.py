@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import egvs
+from egvs.artefacts.readers import LocationVisibility, SiteBlindspots
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
@@ -53,6 +54,32 @@ def test_what_one_sensor_finds_is_the_sum_over_vehicles(sensors: int) -> None:
                     alone += weight[i] * chances[name][i] * others
                     total += weight[i]
             assert found[name].share[k] == pytest.approx(alone / total, rel=1e-12)
+
+
+def location(by: str, words: str, share: float, vehicles: int = 50) -> LocationVisibility:
+    return LocationVisibility(by, words, 0.0, 0.0, 500, vehicles, share, 0.01)
+
+
+def test_sentences_name_the_largest_shares() -> None:
+    locations = (
+        location("all", "all vehicles", 0.123),
+        location("approach", "North Street (north) approach", 0.344),
+        location("exit", "East Street (east) exit", 0.2),
+        location("exit", "East Street (west) exit", 0.1),
+        location("approach", "Mill Lane (west) approach", 0.9, vehicles=3),
+        location("lane", "North Street (north), left-turn lane", 0.41),
+        location("crossing", "North Street (north) crosswalk", 0.004),
+    )
+    found = SiteBlindspots("a", locations, np.empty((0, 0)), (0.0, 0.0), 1.0)
+    assert plan_sensors.describe_found(found) == [
+        "Vehicles that only this sensor finds: 34 % on North Street (north) approach, 20 % on East Street (east) exit "
+        "and 12 % of all vehicles.",
+        "Of lanes, turns and crossings, most on North Street (north), left-turn lane (41 %).",
+    ]
+    no_vehicles: tuple[LocationVisibility, ...] = ()
+    for overall in (no_vehicles, (location("all", "all vehicles", 0.004),)):
+        (text,) = plan_sensors.describe_found(replace(found, locations=overall))
+        assert text == "The other sensors find almost every vehicle that it finds."
 
 
 SCORES = ("expected_detections", "egvs")

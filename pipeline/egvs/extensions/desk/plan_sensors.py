@@ -70,11 +70,11 @@ def describe_additions(context: StageContext, plan: SensorPlan) -> dict[str, lis
         visible = targets.visible(beams)
         points[name], chances[name] = visible.points, detection_probabilities(visible, targets.detectors)
     found = found_by_one(targets.spots, points, chances)
-    return {name: _describe(site_blindspots(name, targets.spots, one, grid)) for name, one in found.items()}
+    return {name: describe_found(site_blindspots(name, targets.spots, one, grid)) for name, one in found.items()}
 
 
-def _describe(found: SiteBlindspots) -> list[str]:
-    """Return where a sensor finds vehicles that no other one finds: streets, then lanes, turns and crossings."""
+def describe_found(found: SiteBlindspots) -> list[str]:
+    """Return where a sensor finds what no other one does (:func:`found_by_one`): streets, then their parts."""
     if found.overall is None or found.overall.share < _LEAST_SHARE:
         return ["The other sensors find almost every vehicle that it finds."]
     streets = [f"{_share(street)} on {street.words}" for street in _largest(found, _STREETS)]

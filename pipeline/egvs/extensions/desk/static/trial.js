@@ -25,7 +25,7 @@ export function drawTrial(plan) {
   return h("section.card", {}, h("h2", {}, "Another sensor on one pole?"),
     h("p.quiet", {}, "A trial: it changes no file."),
     h("div.pair", {},
-      field("site", "Pole", [...present].map(([name, sensor]) => [name, `${name} (${sensor})`])),
+      field("site", "Pole", [...present.keys()].map((name) => [name, name])),
       field("sensor", "Sensor to try", [["", "choose"], ...others.map((/** @type {string} */ name) => [name, name])])),
     h("div.tools", {}, button("Try it", tryIt, { key: "try", isDisabled: isBusy() || !choice.sensor })),
     trial && [
