@@ -20,7 +20,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tomlkit
 
 from egvs.artefacts.run_folder import RUNS, RunFolder
@@ -142,6 +141,7 @@ class Project:
         self._undo: list[Step] = []
         self._redo: list[Step] = []
         self._scenario = load(self.folder)
+        self._candidates: tuple[Scenario | None, tuple[sites.Site, ...]] = (None, ())
         self._problem = ""
         self._contents = self._read()
         if SCENARIO_FILE not in self._contents:
@@ -194,7 +194,7 @@ class Project:
 
     def _load(self) -> Scenario:
         scenario = load(self.folder)
-        sites.candidate_sites(scenario)
+        self._candidates = scenario, sites.candidate_sites(scenario)
         return scenario
 
     def protect_results(self, keep: object) -> None:
@@ -596,19 +596,18 @@ class Project:
             try:
                 traffic = traffic_view.describe_movements(scenario, scene.inputs.network)
                 traffic["signals"] = self._describe_signals()
-                origin = self._origin()
             except EgvsError as error:
-                traffic, origin = {**traffic_view.describe_movements(scenario, None), "signals": []}, None
+                traffic = {**traffic_view.describe_movements(scenario, None), "signals": []}
                 self._problem = self._problem or str(error)
             settings = scenario.traffic
             return {
                 "id": self.identifier, "name": scenario.name, "title": scenario.description or scenario.name,
                 "assumed": list(scenario.assumed), "notes": self.notes, "problem": self._problem,
                 "files": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in self._contents.items()},
-                "roi": {"center_m": scenario.roi.center_m, "size_m": scenario.roi.size_m}, "origin": origin,
+                "roi": {"center_m": scenario.roi.center_m, "size_m": scenario.roi.size_m},
                 "map_key": scene.key,
                 "mounts": {
-                    "sensor": config.sensor, "heights_m": list(config.heights_m or ()), "aim": config.aim,
+                    "sensor": config.sensor, "heights_m": list(config.heights_m or ()),
                     "pitch_deg": list(config.pitch_deg) if isinstance(config.pitch_deg, tuple) else [config.pitch_deg],
                 },
                 "sensors": self._sensor_names(),
@@ -621,18 +620,11 @@ class Project:
                     "warmup_s": settings.warmup_s, "seed": scenario.seed,
                     "traffic_s": None if settings.frames is None else settings.frames * settings.frame_period_s,
                 },
-                "costs": results_view.describe_costs(scenario),
+                "costs": results_view.describe_costs(scenario, self._read_candidates()),
                 "run": {"id": self.run_folder.name, **self.run_state()},
                 "undo": self._undo[-1].label if self._undo else None,
                 "redo": self._redo[-1].label if self._redo else None,
             }  # fmt: skip
-
-    def _origin(self) -> dict[str, float] | None:
-        frame = geolocation.scenario_georeference(self._scenario).frame
-        if frame is None:
-            return None
-        ((lon_deg, lat_deg),) = frame.to_degrees(np.array([self._scenario.roi.center_m[:2]])).tolist()
-        return {"lat_deg": lat_deg, "lon_deg": lon_deg}
 
     def _describe_sites(self) -> list[dict[str, Any]]:
         placement, existing = self._scenario.placement, self._scenario.sites.existing_poles
@@ -649,16 +641,26 @@ class Project:
             })  # fmt: skip
         return described
 
+    def _read_candidates(self) -> tuple[sites.Site, ...]:
+        """Return the candidates of the scenario; none where they cannot be read."""
+        try:
+            if self._candidates[0] is not self._scenario:
+                self._candidates = self._scenario, sites.candidate_sites(self._scenario)
+        except InputError as error:
+            self._problem = self._problem or str(error)
+            return ()
+        return self._candidates[1]
+
     def _site_rows(self) -> list[dict[str, Any]]:
         """Return the rows of the table, else the poles of the scenario; empty where they cannot be read."""
         try:
             if not self._why_no_sites():
                 world = geolocation.scenario_georeference(self._scenario)
                 return [row.columns for row in site_files.read_table(self.folder / self.sites_file, world)[0]]
-            poles = {each.pole: each for each in sites.candidate_sites(self._scenario)}
         except InputError as error:
             self._problem = self._problem or str(error)
             return []
+        poles = {each.pole: each for each in self._read_candidates()}
         return [{"site": name, "x_m": each.pose.x_m, "y_m": each.pose.y_m} for name, each in poles.items()]
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from starlette.routing import Route
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core.errors import EgvsError
+from egvs.core.numbers import number_or_nan
 from egvs.creation.assumed_traffic import TRAFFIC_LEVELS
 from egvs.extensions.desk import downloads, obstacles, results_view
 from egvs.extensions.desk.events import Events
@@ -114,18 +116,19 @@ class Desk:
         """Open a scenario."""
         return self._open(require_text(body, "scenario"))
 
-    def _open(self, identifier: str, notes: list[str] | None = None) -> Answer:
+    def _open(self, identifier: str) -> Answer:
         with self._lock:
             self._refuse_while_running()
-            folder = self.workspace.scenario_folder(identifier)
-            name = folder.name
-            self._project = Project(identifier, folder, self.workspace.run_folder(name), notes or [])
-            named = self._project.scenario.name
-            if named != name:
-                self._project.run_folder = self.workspace.run_folder(named)
-            self._live.close()
-            self._publish_state()
+            self._open_project(identifier)
             return self.state({})
+
+    def _open_project(self, identifier: str, notes: Sequence[str] = ()) -> None:
+        folder = self.workspace.scenario_folder(identifier)
+        project = Project(identifier, folder, self.workspace.run_folder(folder.name), list(notes))
+        project.run_folder = self.workspace.run_folder(project.scenario.name)
+        self._project = project
+        self._live.close()
+        self._publish_state()
 
     def copy(self, body: Body) -> Answer:
         """Copy a shipped scenario, and open it."""
@@ -187,11 +190,8 @@ class Desk:
         folder = self.workspace.new_folder(name)
         at = None
         if body.get("at") is not None:
-            parts = str(body["at"]).split(",")
-            if len(parts) != 2:
-                raise RefusalError(422, "expected two numbers", "Choose a junction.", "at")
-            at = [parse_number(float(part), "at") for part in parts if _is_float(part)]
-            if len(at) != 2:
+            at = [number_or_nan(part) for part in str(body["at"]).split(",")]
+            if len(at) != 2 or not all(map(math.isfinite, at)):
                 raise RefusalError(422, "expected two numbers", "Choose a junction.", "at")
         poles, traffic = body.get("poles", "existing"), body.get("traffic", "medium")
         if poles not in ("existing", "kerbs"):
@@ -200,7 +200,7 @@ class Desk:
             raise RefusalError(422, f"expected one of {', '.join(TRAFFIC_LEVELS)}", "", "traffic")
 
         def finish(result: Answer) -> Answer:
-            self._open_after_job(name, result["notes"])
+            self._open_project(name, result["notes"])
             return result
 
         request = {
@@ -208,11 +208,6 @@ class Desk:
             "walk": body.get("walk") is True, "names": {str(dropped.path): dropped.name},
         }  # fmt: skip
         return self._start_job("new", f"New scenario {name}", request, finish)
-
-    def _open_after_job(self, identifier: str, notes: list[str]) -> None:
-        folder = self.workspace.scenario_folder(identifier)
-        self._project = Project(identifier, folder, self.workspace.run_folder(identifier), notes)
-        self._publish_state()
 
     # ---- changes
 
@@ -505,14 +500,6 @@ class Desk:
 
 
 _POSE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg")
-
-
-def _is_float(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 # ---- HTTP
