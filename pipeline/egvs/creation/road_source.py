@@ -91,9 +91,7 @@ class NetworkRoads:
             try:
                 return cls(road_map, junctions.read_streets(folder / NETWORK_FILE), path)
             except InputError as error:
-                element = error.where.removeprefix(str(folder / NETWORK_FILE)).removeprefix(": ")
-                problem = f"{element}: {error.problem}" if element else error.problem
-                raise InputError(path, f"the network cannot be used: {problem}", "Correct its roads.") from None
+                raise junctions.unusable_network(error, folder / NETWORK_FILE, path) from None
 
     @property
     def network(self) -> str:
