@@ -151,7 +151,8 @@ async function send(method, path, body, onRefusal, keep_results = true) {
     else say(error.message, "error");
   });
   if (!question) return answer;
-  if (await ask("The results will be out of date", `${question} Undo brings them back.`, "Change", "Keep the results")) return send(method, path, body, onRefusal, false);
+  const text = `${question} ${path === "undo" ? "Redo" : "Undo"} brings them back.`;
+  if (await ask("The results will be out of date", text, "Change", "Keep the results")) return send(method, path, body, onRefusal, false);
   update({ project: data.project }); // shows what is still so
   return null;
 }
