@@ -340,7 +340,9 @@ def read_streets(path: Path) -> Streets:
 
 
 def unusable_network(error: InputError, path: Path, road_map: Path) -> InputError:
-    """Return an error about a network that was made from a map, as one about the map."""
+    """Return an error about a network that was made from a map as one about the map, and other errors as they are."""
+    if not error.where.startswith(str(path)):
+        return error
     element = error.where.removeprefix(str(path)).removeprefix(": ")
     problem = f"{element}: {error.problem}" if element else error.problem
     return InputError(road_map, f"the network cannot be used: {problem}", "Correct its roads.")
