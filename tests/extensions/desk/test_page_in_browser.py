@@ -534,7 +534,7 @@ def test_3d_follows_the_chosen_pole(finished: Any) -> None:
     (x, y), (end_x, _) = pixel(tab, "pole_a"), pixel(tab, "pole_b")
     scale = (end_x - x) / 20.5
     drag(tab, (x, y), (x - scale, y))
-    tab.get_by_role("dialog").get_by_role("button", name="Change", exact=True).click()
+    tab.get_by_role("dialog").get_by_role("button", name="Change", exact=True).click(timeout=JOB_MS)
     wait_until(tab, lambda: float(x_m.input_value()) == site(tab, "pole_a")["x_m"] < 10)
     moved = site(tab, "pole_a")
     drag(tab, (x - scale, y), (x + 6 * scale, y + 6 * scale))
