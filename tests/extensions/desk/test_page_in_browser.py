@@ -210,7 +210,7 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
     tab.get_by_role("button", name="Make the scenario").click()
 
     tab.get_by_role("button", name="signal1").click(timeout=JOB_MS)
-    assert credit.is_visible()
+    credit.wait_for()
     assert "signal mast" in tab.get_by_role("region", name="Pole signal1").inner_text()
     type_into(tab, "Height", "4,5")
     wait_until(tab, lambda: site(tab, "signal1")["z_m"] == 4.5)

@@ -68,6 +68,7 @@ def test_sentences_name_the_largest_shares() -> None:
         location("exit", "East Street (west) exit", 0.1),
         location("approach", "Mill Lane (west) approach", 0.9, vehicles=3),
         location("lane", "North Street (north), left-turn lane", 0.41),
+        location("lane", "East Street (east), exit lane", 0.2),
         location("crossing", "North Street (north) crosswalk", 0.004),
     )
     found = SiteBlindspots("a", locations, np.empty((0, 0)), (0.0, 0.0), 1.0)

@@ -77,17 +77,18 @@ def describe_found(found: SiteBlindspots) -> list[str]:
     """Return where a sensor finds what no other one does (:func:`found_by_one`): streets, then their parts."""
     if found.overall is None or found.overall.share < _LEAST_SHARE:
         return ["The other sensors find almost every vehicle that it finds."]
-    streets = [f"{_share(street)} on {street.words}" for street in _largest(found, _STREETS)]
-    shares = [*streets, f"{_share(found.overall)} of all vehicles"]
+    streets = _largest(found.of_kind(*_STREETS))
+    shares = [f"{_share(street)} on {street.words}" for street in streets]
+    shares.append(f"{_share(found.overall)} of all vehicles")
     texts = [f"Vehicles that only this sensor finds: {join_names(shares)}."]
-    if parts := [f"{part.words} ({_share(part)})" for part in _largest(found, _PARTS)]:
-        texts.append(f"Of lanes, turns and crossings, most on {'; '.join(parts)}.")
+    parts = [part for part in found.of_kind(*_PARTS) if part.share not in {street.share for street in streets}]
+    if largest := [f"{part.words} ({_share(part)})" for part in _largest(parts)]:  # an approach may be a single lane
+        texts.append(f"Of lanes, turns and crossings, most on {'; '.join(largest)}.")
     return texts
 
 
-def _largest(found: SiteBlindspots, kinds: Sequence[str]) -> list[LocationVisibility]:
-    largest = found.of_kind(*kinds)[::-1][:_MOST_NAMED]
-    return [location for location in largest if location.share >= _LEAST_SHARE]
+def _largest(worst_first: Sequence[LocationVisibility]) -> list[LocationVisibility]:
+    return [location for location in worst_first[::-1][:_MOST_NAMED] if location.share >= _LEAST_SHARE]
 
 
 def _share(location: LocationVisibility) -> str:
