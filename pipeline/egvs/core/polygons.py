@@ -102,8 +102,7 @@ def _repair_rings(polygon: BaseGeometry, where: object, count: PairCount) -> Bas
     second = np.concatenate([part_of_side[1:][is_pair], np.full(np.count_nonzero(is_outer), outside)])
     neighbours = coo_array((np.ones(len(first)), (first, second)), shape=(outside + 1, outside + 1)).tocsr()
     edges_to_outside = dijkstra(neighbours, directed=False, unweighted=True, indices=outside)[:outside]
-    area: BaseGeometry = shapely.coverage_union_all(parts[edges_to_outside % 2 == 1])
-    return area
+    return shapely.coverage_union_all(parts[edges_to_outside % 2 == 1])
 
 
 def _sides(parts: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -210,8 +209,7 @@ def _are_separated(
     direction = end - start
     side_of_one = direction[:, 0] * (one - start)[:, 1] - direction[:, 1] * (one - start)[:, 0]
     side_of_other = direction[:, 0] * (other - start)[:, 1] - direction[:, 1] * (other - start)[:, 0]
-    are_separated: NDArray[np.bool_] = np.sign(side_of_one) * np.sign(side_of_other) < 0
-    return are_separated
+    return np.sign(side_of_one) * np.sign(side_of_other) < 0
 
 
 def _count_pairs(

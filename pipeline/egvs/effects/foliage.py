@@ -136,8 +136,7 @@ def _cast_positions(scene: Scene) -> FloatArray:
 def _crown_faces(world: World) -> NDArray[np.bool_]:
     """Which faces belong to closed crowns, (faces,) bool."""
     is_crown = np.array([kind == CROWN for _, kind in world.solids], dtype=np.bool_) & world.closed
-    faces: NDArray[np.bool_] = is_crown[world.solid_of_face]
-    return faces
+    return is_crown[world.solid_of_face]
 
 
 def _crown_boxes(world: World) -> FloatArray:

@@ -138,8 +138,7 @@ def transform_gltf_sensor(pose: Pose, origin_m: Matrix) -> Matrix:
     matrix[:3, 3] -= origin_m
     to_gltf = np.eye(4)
     to_gltf[:3, :3] = R_GLTF_WORLD
-    combined: Matrix = to_gltf @ matrix
-    return combined
+    return to_gltf @ matrix
 
 
 def extrinsics_document(

@@ -559,8 +559,7 @@ def target_values(score: str, totals: IntArray, unit: float) -> FloatArray:
         return log_points(totals / unit)
     if score == "seen_well":
         return saturating_gain(totals / unit)
-    values: FloatArray = -np.expm1(-(totals / unit))
-    return values
+    return -np.expm1(-(totals / unit))
 
 
 class CoverageState:
@@ -652,10 +651,8 @@ class Demand:
         """Share of the demand that values fall short by, 0 to 1."""
         missing = np.maximum(self.least - np.asarray(reached), 0.0)
         if not self.least:
-            no_share: FloatArray = 0 * missing
-            return no_share
-        share: FloatArray = np.where(missing > _DEMAND_TOLERANCE * self.least, missing / self.least, 0.0)
-        return share
+            return 0 * missing
+        return np.where(missing > _DEMAND_TOLERANCE * self.least, missing / self.least, 0.0)
 
 
 @dataclass(frozen=True, order=True)

@@ -602,8 +602,7 @@ class _PoseEvaluator:
 def _ground_faces(world: World) -> NDArray[np.bool_]:
     """Return which faces are ground, (n,)."""
     is_ground = np.array([solid == ("ground", "ground") for solid in world.solids], dtype=np.bool_)
-    faces: NDArray[np.bool_] = is_ground[world.solid_of_face]
-    return faces
+    return is_ground[world.solid_of_face]
 
 
 class _SensorSearch:

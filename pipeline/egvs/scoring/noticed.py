@@ -244,8 +244,7 @@ def are_outside_data(visible: TargetVisibility) -> NDArray[np.bool_]:
     record = visible.record
     measured = frozenset[str]().union(*(group.measured for group in road_user_groups()))
     is_measured = np.array([kind in measured for kind in record.kinds], dtype=np.bool_)[record.kind]
-    outside: NDArray[np.bool_] = ~is_measured | (visible.range_m > FARTHEST_M)
-    return outside
+    return ~is_measured | (visible.range_m > FARTHEST_M)
 
 
 def noticed_bounds(visible: TargetVisibility) -> tuple[FloatArray, FloatArray]:

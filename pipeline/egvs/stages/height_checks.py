@@ -279,8 +279,7 @@ def _has_offset_of(is_off: NDArray[np.bool_], offset_m: FloatArray) -> NDArray[n
     """Return which solids have the same offset as those that no slope explains: a slope would depend on distance."""
     if not is_off.any():
         return is_off
-    is_same: NDArray[np.bool_] = np.abs(offset_m - np.median(offset_m[is_off])) <= MARGIN_M
-    return is_same
+    return np.abs(offset_m - np.median(offset_m[is_off])) <= MARGIN_M
 
 
 def _overhead_heights_m(

@@ -181,8 +181,7 @@ def score_run(
         scorer = _window_scorer(work, windows, periods)
 
     def by_frame(values: FloatArray) -> FloatArray:
-        sums: FloatArray = np.bincount(frame, values, n_frames).astype(np.float64)
-        return sums
+        return np.bincount(frame, values, n_frames).astype(np.float64)
 
     def score_site(scan: SiteScan) -> _SiteSums:
         visible = targets.visible(scan.beams)

@@ -168,8 +168,7 @@ def _make_path(title: str, edges: list[Edge], before: Mapping[str, Edge], signal
 
 def _middle_lane(edge: Edge) -> Floats:
     """Return the lane in the middle of an edge from its end to its start, shape (n, 2)."""
-    line: Floats = edge.lanes[len(edge.lanes) // 2].shape_m[::-1, :2]
-    return line
+    return edge.lanes[len(edge.lanes) // 2].shape_m[::-1, :2]
 
 
 def _straight_predecessors(network: Network) -> dict[str, Edge]:

@@ -762,8 +762,7 @@ def _draw_ends(ends: Sequence[int], weights: FloatArray, rng: np.random.Generato
     share = weights[ends]
     if not share.any():
         share = np.ones(len(ends))
-    drawn: IntArray = np.asarray(ends)[np.searchsorted(np.cumsum(share) / share.sum(), rng.random(_MAX_DRAWS))]
-    return drawn
+    return np.asarray(ends)[np.searchsorted(np.cumsum(share) / share.sum(), rng.random(_MAX_DRAWS))]
 
 
 def _follow(towards: IntArray, start: int, end: int) -> list[int]:

@@ -499,5 +499,4 @@ def _distances_m(lanes: RoadLanes, xy_m: FloatArray, motion_rad: FloatArray) -> 
 
 def _wrap(angle_rad: FloatArray) -> FloatArray:
     """Return angles from -pi to pi."""
-    wrapped: FloatArray = np.mod(angle_rad + np.pi, 2.0 * np.pi) - np.pi
-    return wrapped
+    return np.mod(angle_rad + np.pi, 2.0 * np.pi) - np.pi

@@ -229,8 +229,7 @@ class RoadLanes:
         samples_m = self._sample(_LEVEL_SAMPLE_M)
         lanes = self.near(samples_m[:, :2], _BESIDE_M)
         is_other = np.abs(lanes.height_m - samples_m[lanes.row, 2]) > LEVEL_M
-        stacked_m: FloatArray = samples_m[np.unique(lanes.row[is_other]), :2]
-        return stacked_m
+        return samples_m[np.unique(lanes.row[is_other]), :2]
 
     def _levels(self, xy_m: FloatArray, yaw_rad: FloatArray, nearest_m: FloatArray) -> list[list[tuple[float, float]]]:
         """Return the levels at each position from the lowest on: their height, and their cost."""

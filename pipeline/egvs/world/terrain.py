@@ -324,8 +324,7 @@ def _thin_points(points: Floats) -> Floats:
     number = number[is_lowest_level]
     count = np.bincount(number)
     means = [np.bincount(number, weights=points[is_lowest_level, axis]) / count for axis in range(3)]
-    thinned: Floats = np.asarray(np.round(np.column_stack(means), 4) + 0.0, dtype=np.float64)
-    return thinned
+    return np.asarray(np.round(np.column_stack(means), 4) + 0.0, dtype=np.float64)
 
 
 def _rim(low: Floats, high: Floats) -> Floats:

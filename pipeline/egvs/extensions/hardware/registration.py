@@ -396,8 +396,7 @@ def _jackknife(along: FloatArray, curvature: FloatArray, scores: FloatArray, clu
     normals = np.add.reduceat(products, starts, axis=0)
     sums = np.add.reduceat(scores[order], starts, axis=0)
     information = np.bincount(cluster, weights=curvature).astype(np.float64)
-    covariance: FloatArray = one_step_jackknife(normals, sums) + _single_cluster_variance(normals, information)
-    return covariance
+    return one_step_jackknife(normals, sums) + _single_cluster_variance(normals, information)
 
 
 def _single_cluster_variance(normals: FloatArray, information: FloatArray) -> FloatArray:
@@ -548,8 +547,7 @@ def _fixed_inverse(design: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the inverse of the normal matrix in the directions that surfaces fix, (k, k)."""
     basis, _ = _fixed_directions(design, weight)
     along = design @ basis
-    inverse: FloatArray = basis @ np.linalg.inv((along * weight[:, None]).T @ along) @ basis.T
-    return inverse
+    return basis @ np.linalg.inv((along * weight[:, None]).T @ along) @ basis.T
 
 
 def _fixed_directions(design: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:

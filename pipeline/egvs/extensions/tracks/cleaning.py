@@ -258,5 +258,4 @@ def _speeds(part: IntArray, tracks: Tracks) -> FloatArray:
     after[np.diff(part, append=part.max(initial=0) + 1) != 0] -= 1
     distance_m = np.hypot(tracks.x_m[after] - tracks.x_m[before], tracks.y_m[after] - tracks.y_m[before])
     duration_s = tracks.time_s[after] - tracks.time_s[before]
-    speed_m_s: FloatArray = np.divide(distance_m, duration_s, out=np.zeros_like(distance_m), where=duration_s > 0)
-    return speed_m_s
+    return np.divide(distance_m, duration_s, out=np.zeros_like(distance_m), where=duration_s > 0)

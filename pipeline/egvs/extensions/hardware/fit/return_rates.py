@@ -104,8 +104,7 @@ class PlaneView:
 
     def height_m(self, range_m: FloatArray) -> FloatArray:
         """Height of returns at these ranges above the plane."""
-        height: FloatArray = (self.range_m - range_m) * np.cos(np.radians(self.incidence_deg))
-        return height
+        return (self.range_m - range_m) * np.cos(np.radians(self.incidence_deg))
 
 
 def view_of_plane(

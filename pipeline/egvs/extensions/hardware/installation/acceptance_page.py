@@ -199,8 +199,7 @@ def _nearest_in_cell(cell: NDArray[np.int64], ranges_m: FloatArray, shape: tuple
     nearest = np.full(shape[0] * shape[1], np.inf)
     some = ranges_m > 0
     np.minimum.at(nearest, cell[some], ranges_m[some])
-    filled: FloatArray = np.where(np.isfinite(nearest), nearest, 0.0).reshape(shape)
-    return filled
+    return np.where(np.isfinite(nearest), nearest, 0.0).reshape(shape)
 
 
 def _frame(image: IndexedImage, palettes: dict[str, bytes], ends_deg: tuple[float, float], alt: str) -> str:

@@ -94,8 +94,7 @@ class StaticWorld:
         """
         turned = np.ascontiguousarray(directions @ rotation_world_sensor(*pose.angles_deg).T)
         scan = self._caster.sweep(pose.position_m, turned, range_m)
-        ranges: FloatArray = np.where(scan.returned, np.linalg.norm(scan.ends_m, axis=1), np.inf)
-        return ranges
+        return np.where(scan.returned, np.linalg.norm(scan.ends_m, axis=1), np.inf)
 
     def heights_m(self, points_m: FloatArray) -> FloatArray:
         """Return the heights of points (n, 3) of the world frame above the ground, (n,) float64."""
@@ -403,13 +402,11 @@ def channel_elevations_deg(sensor: Sensor) -> FloatArray:
     """
     if sensor.table is None:
         return np.asarray(sensor.elevations_deg, dtype=np.float64)
-    elevations_deg: FloatArray = np.unique(np.round(_elevations_deg(sensor.directions()), 2))
-    return elevations_deg
+    return np.unique(np.round(_elevations_deg(sensor.directions()), 2))
 
 
 def _elevations_deg(directions: FloatArray) -> FloatArray:
-    elevations_deg: FloatArray = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
-    return elevations_deg
+    return np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
 
 
 def _missing_channels(

@@ -113,8 +113,7 @@ def render_view(
     sky = np.array(_COLOURS["sky"], dtype=np.float64)
     picture = np.tile(sky, (len(rays), 1))
     picture[hit] = colours * light[:, None] * (1.0 - fade)[:, None] + sky * fade[:, None]
-    pixels: NDArray[np.uint8] = np.clip(np.rint(picture), 0, 255).astype(np.uint8).reshape(height, width, 3)
-    return pixels
+    return np.clip(np.rint(picture), 0, 255).astype(np.uint8).reshape(height, width, 3)
 
 
 def _style(name: str, kind: str) -> str:

@@ -61,8 +61,7 @@ class StationScan:
 
 def tolerance_m(range_m: FloatArray) -> FloatArray:
     """Return the difference up to which ranges are equal, metres."""
-    tolerances: FloatArray = np.maximum(_TOLERANCE_M, _TOLERANCE_SHARE * range_m)
-    return tolerances
+    return np.maximum(_TOLERANCE_M, _TOLERANCE_SHARE * range_m)
 
 
 def group_by_station(scans: Sequence[StationScan]) -> list[list[int]]:

@@ -271,8 +271,7 @@ def _reach(distances: FloatArray) -> FloatArray:
     """Return how far neighbours (n, k) reach to one side, (n,): not the farthest ones, which noise may have moved."""
     last = distances.shape[1] - 1
     position = max(last - SKIPPED_NEIGHBOURS, 0)
-    reach: FloatArray = np.partition(distances, position, axis=1)[:, position]
-    return reach
+    return np.partition(distances, position, axis=1)[:, position]
 
 
 def _main_directions(offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -288,8 +287,7 @@ def _main_directions(offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _with_fixed_sign(vectors: FloatArray) -> FloatArray:
     largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=1)[:, None], axis=1)
-    fixed: FloatArray = vectors * np.where(largest < 0, -1.0, 1.0)
-    return fixed
+    return vectors * np.where(largest < 0, -1.0, 1.0)
 
 
 def _means_by_cell(points_m: FloatArray, cells: IntArray) -> FloatArray:
@@ -302,10 +300,8 @@ def _means_by_cell(points_m: FloatArray, cells: IntArray) -> FloatArray:
     count = np.diff(starts, append=len(points_m))
     origin = points_m[order[starts]]  # sums of small differences keep their digits far from the world's origin
     differences = points_m[order] - np.repeat(origin, count, axis=0)
-    means: FloatArray = origin + np.add.reduceat(differences, starts, axis=0) / count[:, None]
-    return means
+    return origin + np.add.reduceat(differences, starts, axis=0) / count[:, None]
 
 
 def _rounded(points_m: FloatArray) -> FloatArray:
-    rounded: FloatArray = np.round(points_m, _DIGITS) + 0.0  # no -0
-    return rounded
+    return np.round(points_m, _DIGITS) + 0.0  # no -0

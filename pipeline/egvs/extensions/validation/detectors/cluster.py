@@ -655,5 +655,4 @@ def box_scores(points: IntArray, cost: FloatArray) -> FloatArray:
 
     A cost below 0, possible for a common kind, counts as 0.
     """
-    score: FloatArray = (1.0 - np.exp(-points / SCORE_POINTS)) * np.exp(-np.maximum(cost, 0.0) / SCORE_COST)
-    return score
+    return (1.0 - np.exp(-points / SCORE_POINTS)) * np.exp(-np.maximum(cost, 0.0) / SCORE_COST)

@@ -466,8 +466,7 @@ def _levels(
 
 
 def _members(sample: _Sample, group: str) -> NDArray[np.bool_]:
-    members: NDArray[np.bool_] = np.isin(sample.classes, GROUPS[group]) & sample.used
-    return members
+    return np.isin(sample.classes, GROUPS[group]) & sample.used
 
 
 def _rows_by_range(sample: _Sample) -> Iterator[AgreementRow]:
