@@ -119,7 +119,10 @@ class TargetPositions:
         """Find the positions of a target on the surface of a network, in the region of interest of a grid."""
         cells = [np.empty((0, 2), dtype=np.int64)]
         poses = [np.empty((0, 4))]
-        middles_m = _cell_middles_m(grid)
+        nx, ny = blindspot_map_shape(grid)
+        x_m = grid.origin_m[0] + (np.arange(nx) + 0.5) * CELL_M
+        y_m = grid.origin_m[1] + (np.arange(ny) + 0.5) * CELL_M
+        middles_m = np.stack(np.meshgrid(x_m, y_m, indexing="ij"), axis=-1)
         for area, height_and_yaw in _surfaces(target, network, grid):
             covered = _covered_cells(area, middles_m, grid)
             at_m = middles_m[covered[:, 0], covered[:, 1]]
@@ -168,14 +171,6 @@ def overlap_map(maps: Sequence[PointsMap], points: float = OVERLAP_POINTS) -> Po
     first = maps[0]
     counts = np.sum([points_map.values >= points for points_map in maps], axis=0).astype(np.float64)
     return PointsMap(first.target, np.where(first.on_surface, counts, np.nan), first.origin_m, first.cell_m)
-
-
-def _cell_middles_m(grid: Grid) -> FloatArray:
-    """Middle of each square, (nx, ny, 2)."""
-    nx, ny = blindspot_map_shape(grid)
-    x_m = grid.origin_m[0] + (np.arange(nx) + 0.5) * CELL_M
-    y_m = grid.origin_m[1] + (np.arange(ny) + 0.5) * CELL_M
-    return np.stack(np.meshgrid(x_m, y_m, indexing="ij"), axis=-1)
 
 
 def _covered_cells(area: Any, middles_m: FloatArray, grid: Grid) -> IntArray:

@@ -94,7 +94,7 @@ class ApproachNames:
 
     def heading(self, edge_id: str) -> Floats:
         """Return the direction (2,) in which vehicles arrive at the end of an edge, not normalised."""
-        line_m = self._line_back(edge_id)
+        line_m = _joined(self._edges, edge_id, self._previous, backwards=True)
         edge = self._edges[edge_id]
         middle_m = self._ring_middle_m(edge.to_node, edge.from_node)
         junction_m = line_m[0] if middle_m is None else middle_m
@@ -103,7 +103,7 @@ class ApproachNames:
 
     def exit_heading(self, edge_id: str) -> Floats:
         """Return the direction (2,) in which vehicles leave a junction on an edge, not normalised."""
-        line_m = self._line_ahead(edge_id)
+        line_m = _joined(self._edges, edge_id, self._next, backwards=False)
         edge = self._edges[edge_id]
         middle_m = self._ring_middle_m(edge.from_node, edge.to_node)
         junction_m = line_m[0] if middle_m is None else middle_m
@@ -168,14 +168,6 @@ class ApproachNames:
     def crosswalk(self, crossing_id: str) -> str:
         """Return the name of a crossing, e.g. ``"North Street (north) crosswalk"``."""
         return f"{self.crossed_arm(crossing_id).name} crosswalk"
-
-    def _line_back(self, edge_id: str) -> Floats:
-        """Return a line from the end of an edge backwards, (n, 2), over :data:`HEADING_OVER_M`."""
-        return _joined(self._edges, edge_id, self._previous, backwards=True)
-
-    def _line_ahead(self, edge_id: str) -> Floats:
-        """Return a line from the start of an edge onwards, (n, 2)."""
-        return _joined(self._edges, edge_id, self._next, backwards=False)
 
     def _ring_middle_m(self, node: str, other_node: str) -> Floats | None:
         """Return the middle of the roundabout at a node (2,), for an edge that is not a part of its ring."""

@@ -184,7 +184,8 @@ def triangulate_ground(
     is_inside = np.all((points[:, :2] > low) & (points[:, :2] < high), axis=1)
     rim = _rim(low, high)
     rim = np.column_stack([rim, points[_nearest(points[:, :2], rim), 2]])
-    return _triangulate(np.concatenate([points[is_inside], rim]), low, high)
+    vertices = np.concatenate([points[is_inside], rim])
+    return TerrainSurface(vertices, triangulate(vertices, low), low, high)
 
 
 def _without_bridges(roads: Network, lanes: Sequence[Lane], samples: Sequence[Floats]) -> list[Floats]:
@@ -277,10 +278,19 @@ def _nearest(points: Floats, at: Floats) -> NDArray[np.int64]:
     return index
 
 
-def _triangulate(vertices: Floats, low: Floats, high: Floats) -> TerrainSurface:
+def triangulate(vertices: Floats, origin: Floats) -> NDArray[np.int64]:
+    """Return the Delaunay triangles of points (n, 3) from above, (m, 3) int64, facing up, in an order of their own.
+
+    Parameters
+    ----------
+    vertices
+        The points, metres.
+    origin
+        x and y of a point near them, from which they are triangulated, (2,).
+    """
     from scipy.spatial import Delaunay
 
-    faces = np.asarray(Delaunay(vertices[:, :2] - low).simplices, dtype=np.int64)
+    faces = np.asarray(Delaunay(vertices[:, :2] - origin).simplices, dtype=np.int64)
     ax, ay = vertices[faces[:, 0], :2].T
     bx, by = vertices[faces[:, 1], :2].T
     cx, cy = vertices[faces[:, 2], :2].T
@@ -289,7 +299,7 @@ def _triangulate(vertices: Floats, low: Floats, high: Floats) -> TerrainSurface:
     # each face from its lowest vertex, faces sorted: the result does not depend on Qhull's order
     first = np.argmin(faces, axis=1)
     faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-    return TerrainSurface(vertices, faces[np.lexsort(faces.T[::-1])], low, high)
+    return faces[np.lexsort(faces.T[::-1])]
 
 
 def _sample_lane(lane: Lane, width_m: float) -> Floats:

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
+from egvs.world.terrain import triangulate
 
 GROUND_CELL_M = 0.5
 """Ground vertices: one in each cell of this size."""
@@ -203,22 +204,11 @@ def _window_sizes() -> list[int]:
 
 def triangulate_ground(points_m: FloatArray) -> TriangleSurface:
     """Triangulate ground points (n, 3): Delaunay of the means in cells of ``GROUND_CELL_M``, facing up."""
-    from scipy.spatial import Delaunay
-
     cells = np.floor(points_m[:, :2] / GROUND_CELL_M).astype(np.int64)
     vertices = _rounded(_means_by_cell(points_m, cells))
     if len(vertices) < 3 or np.linalg.matrix_rank(vertices[1:, :2] - vertices[0, :2]) < 2:
         return TriangleSurface(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
-    faces = np.asarray(Delaunay(vertices[:, :2] - vertices[0, :2]).simplices, dtype=np.int64)
-    ax, ay = vertices[faces[:, 0], :2].T
-    bx, by = vertices[faces[:, 1], :2].T
-    cx, cy = vertices[faces[:, 2], :2].T
-    is_down = (bx - ax) * (cy - ay) < (by - ay) * (cx - ax)
-    faces[is_down] = faces[is_down][:, [0, 2, 1]]
-    # each face from its lowest vertex, faces sorted: the result does not depend on Qhull's order
-    first = np.argmin(faces, axis=1)
-    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-    return TriangleSurface(vertices, faces[np.lexsort(faces.T[::-1])])
+    return TriangleSurface(vertices, triangulate(vertices, vertices[0, :2]))
 
 
 def make_surfels(points_m: FloatArray) -> TriangleSurface:
