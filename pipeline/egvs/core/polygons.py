@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core import limits
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
@@ -105,7 +106,7 @@ def _repair_rings(polygon: BaseGeometry, where: object, count: PairCount) -> Bas
     return shapely.coverage_union_all(parts[edges_to_outside % 2 == 1])
 
 
-def _sides(parts: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _sides(parts: NDArray[Any]) -> tuple[IntArray, IntArray]:
     """Return, for each side of each edge, its part and its edge, sorted by edges."""
     import shapely
 
@@ -192,7 +193,7 @@ def check_crossings(shapes: Iterable[BaseGeometry], where: object, count: PairCo
     starts, ends = points[:-1][is_edge], points[1:][is_edge]
     boxes = shapely.box(*np.minimum(starts, ends).T, *np.maximum(starts, ends).T)
 
-    def cross(one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def cross(one: IntArray, other: IntArray) -> BoolArray:
         return _are_separated(starts[one], ends[one], starts[other], ends[other]) & _are_separated(
             starts[other], ends[other], starts[one], ends[one]
         )
@@ -202,9 +203,7 @@ def check_crossings(shapes: Iterable[BaseGeometry], where: object, count: PairCo
     _count_pairs(boxes, where, count, what, is_counted=cross)
 
 
-def _are_separated(
-    start: NDArray[np.float64], end: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _are_separated(start: FloatArray, end: FloatArray, one: FloatArray, other: FloatArray) -> BoolArray:
     """Return for each line (n, 2) from start to end whether two points (n, 2) are on different sides of it."""
     direction = end - start
     side_of_one = direction[:, 0] * (one - start)[:, 1] - direction[:, 1] * (one - start)[:, 0]
@@ -215,7 +214,7 @@ def _are_separated(
 def _count_pairs(
     boxes: NDArray[Any], where: object, count: PairCount | None, what: str, *,
     free: int = _FREE_PAIRS, most: float = 1.0,
-    is_counted: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]] | None = None,
+    is_counted: Callable[[IntArray, IntArray], BoolArray] | None = None,
 ) -> None:  # fmt: skip
     """Add the pairs of boxes that overlap, apart from those that follow each other, to those of a file.
 

@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts.tpog import Tpog
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.core.threads import map_ordered
 from egvs.core.wording import number_of
 from egvs.kernels import submodular
@@ -48,8 +48,6 @@ from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import OccupiedVoxels
 from egvs.scoring.target_scores import log_points, saturating_gain
 from egvs.scoring.targets import SEEN_WELL_POINTS, weighted_mean
-
-BoolArray = NDArray[np.bool_]
 
 Plan = tuple[int, ...]
 """Indices of candidates."""

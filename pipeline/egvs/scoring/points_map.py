@@ -22,9 +22,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.core.grid import BoolArray, FloatArray, Grid, IntArray
 from egvs.effects.returns import ReturnProbability
 from egvs.scoring.blindspots import CELL_M, blindspot_map_shape
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord, visible_targets
@@ -77,7 +76,7 @@ class PointsMap:
     cell_m: float = CELL_M
 
     @property
-    def on_surface(self) -> NDArray[np.bool_]:
+    def on_surface(self) -> BoolArray:
         """Which squares are on the surface, (nx, ny)."""
         return np.logical_not(np.isnan(self.values))
 

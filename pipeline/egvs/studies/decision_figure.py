@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core import files
+from egvs.core.grid import FloatArray
 from egvs.results.studies import SCENARIO, SettingResult, Tolerance
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class LabelPlacement:
         Markers in data coordinates, (n, 2).
     """
 
-    def __init__(self, axes: Any, points: NDArray[np.float64]) -> None:
+    def __init__(self, axes: Any, points: FloatArray) -> None:
         self._axes, self._renderer = axes, axes.figure.canvas.get_renderer()
         self._occupied = [text.get_window_extent(self._renderer) for text in axes.texts]
         self._markers = axes.transData.transform(points)

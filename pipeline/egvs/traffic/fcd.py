@@ -24,11 +24,11 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from egvs.core import limits, reading
 from egvs.core.digests import open_input
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray, IntArray
 from egvs.core.wording import number_of
 from egvs.formats import arrow_bounds, xml
 from egvs.formats.georeference import WGS84, WORLD, CoordinateReading, Georeference, look_like_degrees
@@ -469,7 +469,7 @@ class _RowBatch:
                 hint += " Times are seconds; subtract the start of the recording from dates."
             raise self._error(i, problem, hint)
 
-    def milliseconds(self) -> NDArray[np.int64]:
+    def milliseconds(self) -> IntArray:
         exact = _floats(self.columns["time"]) * 1000.0
         rounded = np.rint(exact)
         for i in np.flatnonzero(np.abs(exact - rounded) > 1e-3):
@@ -477,7 +477,7 @@ class _RowBatch:
             raise self._error(i, problem, "Round the times; SUMO counts in milliseconds.")
         return rounded.astype(np.int64)
 
-    def check_order(self, time_ms: NDArray[np.int64], last_ms: int) -> None:
+    def check_order(self, time_ms: IntArray, last_ms: int) -> None:
         before = np.concatenate([[last_ms], time_ms[:-1]])
         for i in np.flatnonzero(time_ms < before):
             problem = f"time {time_ms[i] / 1000:g} s comes after {before[i] / 1000:g} s"
@@ -490,7 +490,7 @@ class _RowBatch:
         return InputError(f"{self._where} {self._row[i]}", problem, hint)
 
 
-def _to_table(columns: dict[str, Any], time_ms: NDArray[np.int64]) -> pa.Table:
+def _to_table(columns: dict[str, Any], time_ms: IntArray) -> pa.Table:
     import pyarrow.compute as pc
 
     columns = columns | {"time_ms": pa.array(time_ms)}
@@ -500,15 +500,15 @@ def _to_table(columns: dict[str, Any], time_ms: NDArray[np.int64]) -> pa.Table:
     return pa.table([pc.cast(columns[f.name], f.type) for f in FCD_SCHEMA], schema=FCD_SCHEMA)
 
 
-def _floats(column: Any) -> NDArray[np.float64]:
+def _floats(column: Any) -> FloatArray:
     """Convert to float64; nulls become NaN."""
     import pyarrow.compute as pc
 
-    array: NDArray[np.float64] = pc.cast(column, pa.float64()).to_numpy(zero_copy_only=False)
+    array: FloatArray = pc.cast(column, pa.float64()).to_numpy(zero_copy_only=False)
     return array
 
 
-def _true_positions(mask: Any) -> NDArray[np.int64]:
+def _true_positions(mask: Any) -> IntArray:
     return np.flatnonzero(mask.to_numpy(zero_copy_only=False))
 
 
@@ -541,7 +541,7 @@ class FrameGroup:
 
     first_frame: int
     frames: int
-    frame: NDArray[np.int64]
+    frame: IntArray
     rows: pa.Table
 
 
@@ -574,7 +574,7 @@ class _FrameBuffer:
     step_ms: int = 0
     time_steps: int = 0
     start: int = 0
-    frames: list[NDArray[np.int64]] = field(default_factory=list)
+    frames: list[IntArray] = field(default_factory=list)
     tables: list[pa.Table] = field(default_factory=list)
 
     def add(self, table: pa.Table) -> int:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core import polylines
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.traffic.network import LANE_WIDTH_M, Network, is_carriageway
 
 LEVEL_M = 1.5
@@ -144,7 +144,7 @@ class RoadLanes:
         half_width_m = self._half_widths_m.max()
         return np.array([points_m.min(axis=0) - half_width_m, points_m.max(axis=0) + half_width_m])
 
-    def in_junctions(self, xy_m: FloatArray) -> NDArray[np.bool_]:
+    def in_junctions(self, xy_m: FloatArray) -> BoolArray:
         """Return whether positions (n, 2) are inside the outline of a junction, (n,)."""
         import shapely
 

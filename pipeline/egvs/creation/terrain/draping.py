@@ -25,11 +25,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from egvs.core import polylines
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.core.wording import by_number, format_percent, list_first, number_of
 from egvs.creation.map_parts import Terrain
 from egvs.creation.terrain.network_heights import (
@@ -209,7 +208,7 @@ class _Sample:
     """Points (n, 2) along a shape, and which of them are points of the shape."""
 
     xy_m: FloatArray
-    is_given: NDArray[np.bool_]
+    is_given: BoolArray
 
 
 def _sample(shape: ShapeText) -> _Sample:

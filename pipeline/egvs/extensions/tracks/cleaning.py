@@ -20,9 +20,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.extensions.tracks.model import Tracks
 from egvs.extensions.tracks.motion import motion_yaw_rad
 from egvs.traffic.class_sizes import ClassSize
@@ -167,7 +166,7 @@ def clean_tracks(tracks: Tracks, sizes: Mapping[str, ClassSize]) -> CleanTracks:
     )  # fmt: skip
 
 
-def _report_elsewhere(tracks: Tracks, is_repeated: NDArray[np.bool_], report: CleaningReport) -> None:
+def _report_elsewhere(tracks: Tracks, is_repeated: BoolArray, report: CleaningReport) -> None:
     """Count the repeated rows that are in another place than the first row of the same track and time."""
     repeated = np.flatnonzero(is_repeated)
     kept = np.maximum.accumulate(np.where(is_repeated, 0, np.arange(tracks.n_rows)))[repeated]

@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.simulation import CloudSimulator, sweep_rng
-from egvs.clouds.sweeps import BoolArray
 from egvs.core import files
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.core.progress import ProgressCallback
 from egvs.core.threads import map_ordered
 from egvs.extensions.validation import detector_results, kitti

@@ -18,11 +18,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import KDTree
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.extensions.hardware.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
@@ -30,8 +29,6 @@ from egvs.sensors.sites import Pose
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster
 from egvs.world.supports import without_solids
-
-Bools = NDArray[np.bool_]
 
 NEAR_M = 1.5
 """No vehicle comes closer to a sensor on a pole than this."""
@@ -297,13 +294,13 @@ def compare_scans(
     )
 
 
-def _persistent(far_nearer: Bools, beam: IntArray, scan: IntArray, n_scans: int, n_beams: int) -> Bools:
+def _persistent(far_nearer: BoolArray, beam: IntArray, scan: IntArray, n_scans: int, n_beams: int) -> BoolArray:
     """Return which beams are stopped in nearly all of at least :data:`PERSISTENT_SCANS` scans, (beams,)."""
     if n_scans < PERSISTENT_SCANS:
         return np.zeros(n_beams, dtype=np.bool_)
     stopped = np.zeros((n_scans, n_beams), dtype=np.bool_)
     stopped[scan[far_nearer], beam[far_nearer]] = True
-    persistent: Bools = stopped.mean(axis=0) >= PERSISTENT_SHARE
+    persistent: BoolArray = stopped.mean(axis=0) >= PERSISTENT_SHARE
     return persistent
 
 
@@ -320,8 +317,8 @@ def _median_by_beam(beam: IntArray, range_m: FloatArray, n_beams: int) -> FloatA
 
 def _blocked_sectors(
     azimuth_deg: FloatArray,
-    sure: Bools,
-    returned: Bools,
+    sure: BoolArray,
+    returned: BoolArray,
     obstacle_beam: IntArray,
     obstacle_m: FloatArray,
     n_scans: int,
@@ -369,7 +366,7 @@ def _sector(
     return BlockedSector(first_deg, last_deg, bearing_deg, distance_m, elevation_deg, share)
 
 
-def _circular_runs(marked: Bools) -> list[tuple[int, int]]:
+def _circular_runs(marked: BoolArray) -> list[tuple[int, int]]:
     """Return first and last (exclusive) of each run of marked bins on a circle; a gap of one bin does not end a run.
 
     Examples
@@ -410,7 +407,7 @@ def _elevations_deg(directions: FloatArray) -> FloatArray:
 
 
 def _missing_channels(
-    sensor: Sensor, elevation_deg: FloatArray, sure: Bools, returned: Bools
+    sensor: Sensor, elevation_deg: FloatArray, sure: BoolArray, returned: BoolArray
 ) -> tuple[tuple[float, ...], int | None]:
     """Return the elevations of channels without returns, and how many could not be checked (None without channels)."""
     elevations = channel_elevations_deg(sensor)

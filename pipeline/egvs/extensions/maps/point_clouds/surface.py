@@ -25,9 +25,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.world.terrain import triangulate
 
 GROUND_CELL_M = 0.5
@@ -116,7 +115,7 @@ def thin_points(points_m: FloatArray, cell_m: float) -> FloatArray:
     return _means_by_cell(points_m, cells)
 
 
-def is_ground(points_m: FloatArray) -> NDArray[np.bool_]:
+def is_ground(points_m: FloatArray) -> BoolArray:
     """Return which points (n, 3) lie on the ground, (n,) bool.
 
     A point is on the ground when the lowest point of its cell survives all openings, and it is at most ``STEP_M`` above
@@ -132,7 +131,7 @@ def is_ground(points_m: FloatArray) -> NDArray[np.bool_]:
     heights[is_pit] = np.inf
     lowest = _fill_gaps(heights)
     is_low = _survives_openings(lowest - _trend(lowest)) & ~is_pit
-    on_ground: NDArray[np.bool_] = is_low[column, row] & (points_m[:, 2] <= lowest[column, row] + STEP_M)
+    on_ground: BoolArray = is_low[column, row] & (points_m[:, 2] <= lowest[column, row] + STEP_M)
     return on_ground
 
 
@@ -148,11 +147,11 @@ def _fill_gaps(heights: FloatArray) -> FloatArray:
     return filled
 
 
-def _pits(heights: FloatArray) -> NDArray[np.bool_]:
+def _pits(heights: FloatArray) -> BoolArray:
     """Return the cells that are far below all their neighbours: returns by way of a mirror, not ground."""
     from scipy.ndimage import grey_closing
 
-    deep: NDArray[np.bool_] = grey_closing(heights, size=(3, 3)) - heights > PIT_M
+    deep: BoolArray = grey_closing(heights, size=(3, 3)) - heights > PIT_M
     return deep
 
 
@@ -179,7 +178,7 @@ def _along_plane(terms: FloatArray, plane: FloatArray) -> FloatArray:
     return heights
 
 
-def _survives_openings(heights: FloatArray) -> NDArray[np.bool_]:
+def _survives_openings(heights: FloatArray) -> BoolArray:
     """Return which cells stand out by no more than ``STEP_M`` in openings with growing windows."""
     from scipy.ndimage import grey_opening
 

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import grey_erosion, map_coordinates
 
-from egvs.clouds.sweeps import BoolArray, SiteView, Sweep
-from egvs.core.grid import FloatArray, Roi
+from egvs.clouds.sweeps import SiteView, Sweep
+from egvs.core.grid import BoolArray, FloatArray, Roi
 from egvs.sensors.sensor import rotation_world_sensor
 
 MARGIN_M = 0.15

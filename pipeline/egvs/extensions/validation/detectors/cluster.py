@@ -41,9 +41,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from egvs.clouds.sweeps import BoolArray, Detections, SiteView, Sweep
+from egvs.clouds.sweeps import Detections, SiteView, Sweep
 from egvs.core import files
-from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 from egvs.core.special import cosdg, sindg
 from egvs.extensions.validation.detectors import background
 from egvs.extensions.validation.detectors.background import GroundMap, empty_scan_points
