@@ -535,7 +535,7 @@ def _draw_traffic(context: LayerContext) -> str:
     points, point_colours = column_points(tpog, tpog.p, context.zero_m)
     context.draw_columns(points, point_colours, tpog.grid.voxel_m)
     peak = float(tpog.p.sum(axis=2).max(initial=0.0))
-    return _scale_legend("share of time for which voxels are occupied by vehicles, summed over height", 0.0, peak)
+    return _scale_legend("share of time for which voxels are occupied by vehicles, summed over height", peak)
 
 
 def _draw_entropy(context: LayerContext) -> str:
@@ -547,7 +547,7 @@ def _draw_entropy(context: LayerContext) -> str:
     points, point_colours = column_points(session.tpog, entropy, context.zero_m, peak)
     context.draw_columns(points, point_colours, session.tpog.grid.voxel_m)
     where = "that beams cross" if draws_seen else "that no beam crosses"
-    return _scale_legend(f"entropy (bits) of voxels {where}, summed over height", 0.0, peak)
+    return _scale_legend(f"entropy (bits) of voxels {where}, summed over height", peak)
 
 
 def _draw_blindspots(context: LayerContext) -> str:
@@ -562,7 +562,7 @@ def _draw_blindspots(context: LayerContext) -> str:
         overall = f"all vehicles: {format_percent(spots.overall.share)} found"
     rows = [f"<b>{_escape_html(overall)}</b>"]
     rows += [_escape_html(f"{location.words}: {format_percent(location.share, 0)} found") for location in spots.worst]
-    return _scale_legend("share of vehicles not found", 0.0, 1.0, partial(format_percent, digits=0)) + text_legend(rows)
+    return _scale_legend("share of vehicles not found", 1.0, partial(format_percent, digits=0)) + text_legend(rows)
 
 
 def _draw_points(context: LayerContext) -> str:
@@ -683,11 +683,11 @@ _DRAW_FUNCTIONS: dict[str, Callable[[LayerContext], str]] = {
 }
 
 
-def _scale_legend(title: str, low: float, high: float, format_number: Callable[[float], str] = "{:.3g}".format) -> str:
+def _scale_legend(title: str, high: float, format_number: Callable[[float], str] = "{:.3g}".format) -> str:
     """Return a colour bar with its ends."""
     stops = ", ".join(map(_css_colour, colour_scale(np.linspace(0.0, 1.0, _LEGEND_STEPS)).tolist()))
     bar = f'<div style="height:0.7em;background:linear-gradient(to right, {stops})"></div>'
-    ends = f"<span>{format_number(low)}</span><span>{format_number(high)}</span>"
+    ends = f"<span>{format_number(0.0)}</span><span>{format_number(high)}</span>"
     return _legend_box(f'{title}{bar}<div style="display:flex;justify-content:space-between">{ends}</div>')
 
 

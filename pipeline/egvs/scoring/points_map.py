@@ -157,18 +157,16 @@ class TargetPositions:
         return PointsMap(self.target, values, (self.grid.origin_m[0], self.grid.origin_m[1]))
 
 
-def overlap_map(maps: Sequence[PointsMap], points: float = OVERLAP_POINTS) -> PointsMap:
-    """Return by how many sensors each square gets at least a number of points.
+def overlap_map(maps: Sequence[PointsMap]) -> PointsMap:
+    """Return by how many sensors each square gets at least :data:`OVERLAP_POINTS`.
 
     Parameters
     ----------
     maps
         One map of each sensor, of the same target; at least one.
-    points
-        Number of points from which on a sensor counts.
     """
     first = maps[0]
-    counts = np.sum([points_map.values >= points for points_map in maps], axis=0).astype(np.float64)
+    counts = np.sum([points_map.values >= OVERLAP_POINTS for points_map in maps], axis=0).astype(np.float64)
     return PointsMap(first.target, np.where(first.on_surface, counts, np.nan), first.origin_m, first.cell_m)
 
 

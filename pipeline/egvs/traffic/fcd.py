@@ -123,19 +123,17 @@ def has_heights(path: Path) -> bool:
     InputError
         As :func:`read_fcd` for the head of the file.
     """
-    with closing(_source_batches(path, "vehicle")[0]) as batches:
+    with closing(_source_batches(path)[0]) as batches:
         return any("z" in batch.schema.names for batch in itertools.islice(batches, 1))
 
 
-def read_fcd(path: Path, element: str = "vehicle") -> Iterator[pa.Table]:
-    """Read a file.
+def read_fcd(path: Path) -> Iterator[pa.Table]:
+    """Read the vehicles of a file.
 
     Parameters
     ----------
     path
         The file.
-    element
-        ``"vehicle"``, or ``"person"`` for a file of ``--person-fcd-output``; slopes of persons are set to 0.
 
     Yields
     ------
@@ -148,7 +146,7 @@ def read_fcd(path: Path, element: str = "vehicle") -> Iterator[pa.Table]:
         Names the file and the row if a column is missing, a value is not a number, times are not in order, or the file
         is damaged.
     """
-    yield from _checked_tables(*_source_batches(path, element))
+    yield from _checked_tables(*_source_batches(path))
 
 
 def read_growing_fcd(path: Path, element: str, has_ended: Callable[[], bool]) -> Iterator[pa.Table]:
@@ -159,7 +157,7 @@ def read_growing_fcd(path: Path, element: str, has_ended: Callable[[], bool]) ->
     path
         The file; it need not exist yet.
     element
-        As for :func:`read_fcd`.
+        ``"vehicle"``, or ``"person"`` for a file of ``--person-fcd-output``; slopes of persons are set to 0.
     has_ended
         Whether nothing will be added. An error that it raises ends the reading, before the last lines are read.
 
@@ -171,7 +169,7 @@ def read_growing_fcd(path: Path, element: str, has_ended: Callable[[], bool]) ->
     yield from _checked_tables(_read_growing_csv(path, element, has_ended), path, "row")
 
 
-def _source_batches(path: Path, element: str) -> tuple[Generator[pa.RecordBatch, None, None], Path, str]:
+def _source_batches(path: Path) -> tuple[Generator[pa.RecordBatch, None, None], Path, str]:
     """Return the batches of a file with the columns that are used, the file, and what it calls a row."""
     if not path.is_file():
         raise InputError(path, "no such file", "Use a file that SUMO wrote with --fcd-output.")
@@ -180,12 +178,12 @@ def _source_batches(path: Path, element: str) -> tuple[Generator[pa.RecordBatch,
     if not head:
         raise InputError(path, "is empty", EXPECTED_FCD)
     if head.startswith(b"<"):
-        return _read_xml(path, element), path, f"{element} element"
+        return _read_xml(path), path, "vehicle element"
     read = _read_parquet if head.startswith(b"PAR1") else _read_csv
-    return read(path, element), path, "row"
+    return read(path), path, "row"
 
 
-def _read_csv(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:
+def _read_csv(path: Path) -> Generator[pa.RecordBatch, None, None]:
     from pyarrow import csv
 
     with (
@@ -193,7 +191,7 @@ def _read_csv(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]
         xml.open_bounded(path) as file,
     ):
         header = xml.read_line(file, path)
-    layout = _CsvLayout.of(header, path, element)
+    layout = _CsvLayout.of(header, path, "vehicle")
     options = csv.ReadOptions(block_size=_BLOCK_BYTES, use_threads=False)
     with (
         reading.translate_errors(path, _COMPLETE_FILE, "cannot be read as CSV"),
@@ -266,12 +264,12 @@ class _CsvLayout(NamedTuple):
         return cls(list(columns), csv.ParseOptions(delimiter=delimiter), convert)
 
 
-def _read_parquet(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:
+def _read_parquet(path: Path) -> Generator[pa.RecordBatch, None, None]:
     import pyarrow.parquet as pq
 
     with _translate_parquet_errors(path), _open_seekable(path) as source:
         with pq.ParquetFile(source) as file:
-            columns = _source_columns(file.schema_arrow.names, path, element)
+            columns = _source_columns(file.schema_arrow.names, path, "vehicle")
             _check_rows(file.metadata.num_rows, source, path)
             largest = max(arrow_bounds.parquet_group_bytes(file, source, list(columns.values()), path), default=0)
             problem = f"has a row group of {largest / limits.MB:,.0f} MB after decompression"
@@ -324,16 +322,13 @@ def _check_rows(rows: int, source: Path | IO[bytes], path: Path) -> None:
         raise InputError(path, f"declares {rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)
 
 
-def _read_xml(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:
+def _read_xml(path: Path) -> Generator[pa.RecordBatch, None, None]:
     rows: list[dict[str, str]] = []
     steps = _StepCheck(path)
     for step in xml.iter_elements(path, "fcd-export"):
         steps.add(step.get("time", ""))
-        for child in step.iter(element):
-            row = {**child.attrib, "time": step.get("time", "")}
-            if element == "person":
-                row.pop("slope", None)
-            rows.append(row)
+        for vehicle in step.iter("vehicle"):
+            rows.append({**vehicle.attrib, "time": step.get("time", "")})
         if len(rows) >= _BATCH_ROWS:
             yield _xml_batch(rows, path)
             rows.clear()
