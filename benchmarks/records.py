@@ -168,7 +168,7 @@ def table_results(tables: Mapping[str, Iterable[Sequence[Any]]]) -> list[Result]
 def parse_quantity(text: str) -> tuple[float | None, str]:
     """Return the number that a text starts with, and the unit after it.
 
-    >>> parse_quantity("2.35 s = 0.80 x (2 x SUMO + 3 s)")
+    >>> parse_quantity("2.35 s = SUMO + 2.10 s")
     (2.35, 's')
     >>> parse_quantity("1,024 MB")
     (1024.0, 'MB')

@@ -1,6 +1,7 @@
 """Which reader opens a map file, and what a set of files is rejected for."""
 
 import gzip
+import re
 import zipfile
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from egvs.core import readers
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.creation import map_readers
 from egvs.creation.map_parts import RoadMap
+from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
 from egvs.creation.road_source import NetworkRoads
 from tests.core.test_plugins import install_readers, site  # noqa: F401  the fixture
 from tests.installed import needs
@@ -146,3 +148,25 @@ def test_unusable_network_names_the_map_and_no_temporary_file(tmp_path: Path) ->
     message = str(caught.value)
     assert message.startswith(f"{tmp_path / 'roads.xodr'}: the network cannot be used: ")
     assert "network.net.xml" not in message
+
+
+def test_street_of_a_thousand_kilometres_names_the_extract(tmp_path: Path) -> None:
+    osm = tmp_path / "long.osm"
+    text, far = SMALL.read_text(encoding="utf-8"), 'id="104" lat="52.0017975" lon="-10"'
+    assert 'id="104" lat="52.0017975" lon="10.0000000"' in text
+    osm.write_text(text.replace('id="104" lat="52.0017975" lon="10.0000000"', far), encoding="utf-8")
+    with pytest.raises(InputError, match=r"expected a shape of at most 1,000,000 m, got 1,377,\d+ m") as caught:
+        create_scenario(tmp_path / "made", osm)
+    assert str(caught.value).startswith(f"{osm}: the network cannot be used: lane ")
+
+
+def test_signal_that_cannot_be_read_names_the_network(tmp_path: Path) -> None:
+    create_scenario(tmp_path / "made", SMALL)
+    text = (tmp_path / "made" / "network.net.xml").read_text(encoding="utf-8")
+    damaged, count = re.subn(r'(<tlLogic [^>]*offset=)"[^"]*"', r'\1"1e14"', text)
+    assert count == 1
+    path = tmp_path / "roads.net.xml"
+    path.write_text(damaged, encoding="utf-8")
+    with pytest.raises(InputError, match=r"a signal \(offset = 1e\+14: expected seconds, at most 1e\+09\)") as caught:
+        create_scenario(tmp_path / "again", path, options=NewScenarioOptions(traffic=200))
+    assert str(caught.value).startswith(f"{path}: the network cannot be used: invalid <tlLogic>")

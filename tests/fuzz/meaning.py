@@ -15,7 +15,7 @@ import struct
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
@@ -157,12 +157,12 @@ def words(data: bytes) -> object:
     return [line.split() for line in data.decode().splitlines()]
 
 
-def parquet(data: bytes) -> object:
-    """Columns and values."""
+def parquet(data: bytes, columns: Sequence[str] | None = None) -> object:
+    """Columns and values; of some columns if the others are not read."""
     import pyarrow
     import pyarrow.parquet as pq
 
-    table = pq.read_table(pyarrow.BufferReader(data))
+    table = pq.read_table(pyarrow.BufferReader(data), columns=columns)
     return repr(table.to_pydict())
 
 

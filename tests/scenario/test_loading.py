@@ -138,6 +138,16 @@ def test_rejects_override_without_effect(mini: Path, overrides: list[str], messa
     assert message in str(error.value)
 
 
+@pytest.mark.parametrize("vclass", ["", "a bus", "Bus", "x" * 41])
+def test_kind_with_a_wrong_class_is_the_only_problem(mini: Path, vclass: str) -> None:
+    kind = f"{{name='car', vclass='{vclass}', length_m=4, width_m=2, height_m=1}}"
+    with pytest.raises(InputError) as error:
+        egvs.load(mini, [f"traffic.kinds=[{kind}]"])
+    assert str(error.value) == (
+        f"--set: traffic.kinds.0.vclass: expected a vClass of SUMO, such as passenger or bus, got {vclass!r}"
+    )
+
+
 def test_last_value_of_a_key_counts(mini: Path) -> None:
     scenario = egvs.load(mini, ["sites.yaw_deg=90", "sites.yaw_deg=45", "traffic.fcd='fcd.csv'", "traffic.frames=20"])
     assert (scenario.sites.yaw_deg, scenario.traffic.frames) == (45.0, 20)

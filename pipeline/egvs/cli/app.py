@@ -603,6 +603,10 @@ def sensors(
             run_tables.print_sensor_details([custom[name] if name in custom else CATALOGUE[name]], loaded)
 
 
+_RECORDED, _RARE = "Recorded traffic and signals", "For special cases"
+"""Panels of ``egvs new --help`` below the options that most scenarios need."""
+
+
 @app.command(cls=cli_options.NewCommand)
 def new(
     folder: Annotated[
@@ -625,41 +629,25 @@ def new(
         str | None,
         typer.Option(
             metavar="LAT,LON",
-            help="Use the junction at this point; if there is none, the nearest one with signals within 40 m, or else "
-            "the nearest one within 100 m. X,Y in metres if the road map has no reference system. Default: the largest"
-            " junction with signals.",
+            help="The junction at this point; else the nearest one with signals within 40 m, or without within 100 m."
+            " X,Y in metres if the road map has no reference system. Default: the largest junction with signals.",
         ),
     ] = None,
+    list_: Annotated[
+        bool,
+        typer.Option(
+            "--list",
+            help="List the junctions of the road map: names, arms, signals, --at. With --at, the nearest first."
+            " Nothing is written.",
+        ),
+    ] = False,
     download: Annotated[
         bool,
         typer.Option(
             "--download",
-            help="Download the OpenStreetMap extract around --at LAT,LON from an Overpass server. Nothing is downloaded"
-            " without this option.",
+            help="Download the OpenStreetMap extract around --at LAT,LON from an Overpass server.",
         ),
     ] = False,
-    overpass_url: Annotated[
-        str | None,
-        typer.Option(
-            "--overpass",
-            metavar="URL",
-            help="Overpass server for --download; default: EGVS_OVERPASS_URL, or overpass-api.de.",
-        ),
-    ] = None,
-    lefthand: Annotated[
-        bool,
-        typer.Option("--lefthand", help="Traffic drives on the left; by default, the map and its position decide."),
-    ] = False,
-    righthand: Annotated[bool, typer.Option("--righthand", help="Traffic drives on the right.")] = False,
-    walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
-    surroundings: Annotated[
-        str | None,
-        typer.Option(
-            metavar="METRES",
-            help="Simulate the streets within this radius of the junction, or 'all'; 300 by default for OpenStreetMap,"
-            " 'all' for other maps.",
-        ),
-    ] = None,
     traffic: Annotated[
         str | None,
         typer.Option(
@@ -667,10 +655,6 @@ def new(
             help="light, medium (default) or heavy: 40, 75 or 100 % of the flow that the junction can carry, up to the"
             " usual flow for its road classes.",
         ),
-    ] = None,
-    vehicles_per_hour: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Instead of --traffic: vehicles per hour that pass the junction, in all."),
     ] = None,
     counts: Annotated[
         Path | None,
@@ -688,19 +672,24 @@ def new(
             " spread over the arms of the junction. existing: the lamps, signal masts and utility poles of the map.",
         ),
     ] = None,
-    align: Annotated[
-        list[str] | None,
+    surroundings: Annotated[
+        str | None,
         typer.Option(
-            metavar="X,Y=LAT,LON",
-            help="A point of the files without a reference system, in metres, and where it is; give two points.",
+            metavar="METRES",
+            help="Simulate the streets within this radius of the junction, or 'all'; 300 by default for OpenStreetMap,"
+            " 'all' for other maps.",
         ),
     ] = None,
+    run_: Annotated[
+        bool, typer.Option("--run", help="Run the new scenario at once, as egvs run does, up to the ranking.")
+    ] = False,
     tracks: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="FILE",
             help="Recorded tracks of road users, or a folder of them, instead of simulated traffic. Several files on"
             " one clock: --tracks A --tracks B.",
+            rich_help_panel=_RECORDED,
         ),
     ] = None,
     like: Annotated[
@@ -709,6 +698,7 @@ def new(
             metavar="FILE",
             help="Recorded tracks, or a folder of them, from which turning counts, fleet, speeds and gaps of simulated"
             " traffic are estimated.",
+            rich_help_panel=_RECORDED,
         ),
     ] = None,
     pedestrian_tracks: Annotated[
@@ -718,6 +708,7 @@ def new(
             metavar="FILE",
             help="Recorded tracks of people on foot and on bicycles, or a folder of them, beside simulated vehicles."
             " Give the signals that they were recorded under by --signals.",
+            rich_help_panel=_RECORDED,
         ),
     ] = None,
     signals: Annotated[
@@ -726,6 +717,7 @@ def new(
             metavar="FILE",
             help="Recorded signals of the junction, and a file that assigns their groups to lanes (KML or CSV); without"
             " one, it is guessed from the tracks. --signals A --signals B.",
+            rich_help_panel=_RECORDED,
         ),
     ] = None,
     track_columns: Annotated[
@@ -734,6 +726,7 @@ def new(
             "--track-columns",
             metavar="FILE",
             help="TOML file that names the columns of tracks in a table of your own (CSV or JSON lines).",
+            rich_help_panel=_RECORDED,
         ),
     ] = None,
     track_crs: Annotated[
@@ -743,6 +736,37 @@ def new(
             metavar="CRS",
             help="Coordinate system of the tracks, if it is not the one of their format: e.g. EPSG:25832, or 'world'"
             " for metres of the road map.",
+            rich_help_panel=_RECORDED,
+        ),
+    ] = None,
+    vehicles_per_hour: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Instead of --traffic: vehicles per hour that pass the junction, in all.",
+            rich_help_panel=_RARE,
+        ),
+    ] = None,
+    walk: Annotated[
+        bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.", rich_help_panel=_RARE)
+    ] = False,
+    lefthand: Annotated[
+        bool,
+        typer.Option(
+            "--lefthand",
+            help="Traffic drives on the left; by default, the map and its position decide.",
+            rich_help_panel=_RARE,
+        ),
+    ] = False,
+    righthand: Annotated[
+        bool, typer.Option("--righthand", help="Traffic drives on the right.", rich_help_panel=_RARE)
+    ] = False,
+    align: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y=LAT,LON",
+            help="A point of the files without a reference system, in metres, and where it is; give two points.",
+            rich_help_panel=_RARE,
         ),
     ] = None,
     surface: Annotated[
@@ -751,19 +775,18 @@ def new(
             metavar="FILE",
             help="A raster of the heights of roofs and trees. With a terrain, buildings without a height get their"
             " height from it.",
+            rich_help_panel=_RARE,
         ),
     ] = None,
-    list_: Annotated[
-        bool,
+    overpass_url: Annotated[
+        str | None,
         typer.Option(
-            "--list",
-            help="List the junctions of the road map: names, arms, signals, --at. With --at, the nearest first."
-            " Nothing is written.",
+            "--overpass",
+            metavar="URL",
+            help="Overpass server for --download; default: EGVS_OVERPASS_URL, or overpass-api.de.",
+            rich_help_panel=_RARE,
         ),
-    ] = False,
-    run_: Annotated[
-        bool, typer.Option("--run", help="Run the new scenario at once, as egvs run does, up to the ranking.")
-    ] = False,
+    ] = None,
 ) -> None:
     """Create a scenario from maps of roads, buildings and other objects.
 

@@ -46,6 +46,7 @@ import shapely
 from shapely.geometry import LineString, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
+from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray
 from egvs.creation import arms, roundabouts
 from egvs.creation.roundabouts import Ring
@@ -336,6 +337,15 @@ def read_streets(path: Path) -> Streets:
         if governed <= others and max(east_m - west_m, north_m - south_m) <= ROI_MAX_M:
             junctions = [junction for junction in junctions if junction.id not in governed] + [joined]
     return Streets(network, areas, tuple(junctions), tuple(large_rings))
+
+
+def unusable_network(error: InputError, path: Path, road_map: Path) -> InputError:
+    """Return an error about a network that was made from a map as one about the map, and other errors as they are."""
+    if not error.where.startswith(str(path)):
+        return error
+    element = error.where.removeprefix(str(path)).removeprefix(": ")
+    problem = f"{element}: {error.problem}" if element else error.problem
+    return InputError(road_map, f"the network cannot be used: {problem}", "Correct its roads.")
 
 
 def _lane_areas(edges: Sequence[Edge]) -> dict[str, BaseGeometry]:

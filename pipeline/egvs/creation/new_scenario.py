@@ -32,7 +32,6 @@ import numpy as np
 import tomlkit
 from shapely.geometry.base import BaseGeometry
 
-from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
 from egvs.core.progress import ProgressCallback, no_progress
@@ -66,7 +65,7 @@ from egvs.creation.map_readers import MapFile, MapFiles
 from egvs.creation.new_traffic import NewTraffic, RecordingOptions, RecordingPlan, ScenarioTraffic
 from egvs.creation.openstreetmap import ATTRIBUTION
 from egvs.creation.plain_network import NETWORK_FILE
-from egvs.creation.road_source import NetworkRoads, RoadSource
+from egvs.creation.road_source import NetworkRoads, RoadSource, network_file
 from egvs.creation.scenario_files import (
     COUNTS_FILE,
     PITCHES_DEG,
@@ -698,9 +697,8 @@ def _find_assumed_signal(draft: _Draft) -> Signal | None:
     """Return the signal of the junction if its plan is assumed, rather than recorded or a program of the user."""
     if not draft.junction.signalised or draft.plan.is_finished or draft.plan.signal_notes:
         return None
-    with files.temporary_folder() as folder:
-        files.write_text(folder / NETWORK_FILE, draft.plan.network)
-        signals = read_signals(folder / NETWORK_FILE, draft.roads.streets.network)
+    with network_file(draft.plan.network, draft.roads.path) as network:
+        signals = read_signals(network, draft.roads.streets.network)
     of_junction = [signal for signal in signals if not set(signal.nodes).isdisjoint(draft.junction.nodes)]
     return of_junction[0] if len(of_junction) == 1 and is_assumed(of_junction[0]) else None
 

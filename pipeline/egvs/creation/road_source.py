@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -28,6 +30,10 @@ class RoadSource(Protocol):
     @property
     def network(self) -> str:
         """The text of the network."""
+
+    @property
+    def path(self) -> Path:
+        """The file of the map."""
 
     @property
     def streets(self) -> Streets:
@@ -62,6 +68,17 @@ class RoadSource(Protocol):
         """Return the static objects of the road map in a window (world frame, metres); None: its reader reads them."""
 
 
+@contextmanager
+def network_file(network: str, road_map: Path) -> Iterator[Path]:
+    """Write a network that was made from a map to a temporary file; errors about it name the map."""
+    with files.temporary_folder() as folder:
+        files.write_text(folder / NETWORK_FILE, network)
+        try:
+            yield folder / NETWORK_FILE
+        except InputError as error:
+            raise junctions.unusable_network(error, folder / NETWORK_FILE, road_map) from None
+
+
 @dataclass(frozen=True)
 class NetworkRoads:
     """Roads of a map that is converted as a whole; they are not divided by level, and cut on request only."""
@@ -86,14 +103,8 @@ class NetworkRoads:
         InputError
             When the network has no road, or SUMO cannot have written it.
         """
-        with files.temporary_folder() as folder:
-            (folder / NETWORK_FILE).write_text(road_map.network, encoding="utf-8")
-            try:
-                return cls(road_map, junctions.read_streets(folder / NETWORK_FILE), path)
-            except InputError as error:
-                element = error.where.removeprefix(str(folder / NETWORK_FILE)).removeprefix(": ")
-                problem = f"{element}: {error.problem}" if element else error.problem
-                raise InputError(path, f"the network cannot be used: {problem}", "Correct its roads.") from None
+        with network_file(road_map.network, path) as network:
+            return cls(road_map, junctions.read_streets(network), path)
 
     @property
     def network(self) -> str:

@@ -170,7 +170,8 @@ def _read_file(path: Path, name: str) -> list[Sweep]:
         if chunk.station_m is not None and path.suffix.lower() == ".pcd":
             raise InputError(name, "expected points in the sensor's frame, got a VIEWPOINT", _FRAME_HINT)
         origin_m = np.zeros(3) if chunk.station_m is None else chunk.station_m
-        chunks.append(chunk.points_m - origin_m)
+        with np.errstate(invalid="ignore"):  # a signalling NaN is a missing return like any other
+            chunks.append(chunk.points_m - origin_m)
     if not chunks:
         raise InputError(name, "expected a sweep, got no points", COMPLETE_FILE)
     sweep = _clean_sweep(name, np.concatenate(chunks))

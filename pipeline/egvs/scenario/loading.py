@@ -116,6 +116,8 @@ def _key_problems(error: ValidationError, model: type[BaseModel], parents: tuple
         match item["type"]:
             case "default_factory_not_called":
                 continue  # follows from another problem, which is reported
+            case "too_short" if len(item["input"]) >= context["min_length"]:
+                continue  # so does this: items with problems are not counted
             case "extra_forbidden":
                 yield _KeyProblem(key, "unknown key", _suggest_key(item["loc"], model))
             case "missing":

@@ -36,6 +36,13 @@ class VehicleKind(StrictModel):
         default_factory=dict, description="Further attributes of the SUMO vType, by SUMO's names"
     )
 
+    @field_validator("vclass")
+    @classmethod
+    def _check_vclass(cls, vclass: str) -> str:
+        if re.fullmatch("[a-z0-9_]{1,40}", vclass) is None:
+            raise ValueError(f"expected a vClass of SUMO, such as passenger or bus, got {vclass[:80]!r}")
+        return vclass
+
     @field_validator("attributes")
     @classmethod
     def _check_attribute_names(cls, attributes: dict[str, str | float]) -> dict[str, str | float]:

@@ -58,7 +58,7 @@ from typing import Any, get_args
 import numpy as np
 
 from egvs.core import plugins
-from egvs.core.errors import RunError
+from egvs.core.errors import InputError, RunError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
 from egvs.kernels.boosted_trees import add_tree_values
@@ -448,15 +448,15 @@ def load_vehicle_score(name: str) -> VehicleScore:
     Raises
     ------
     InputError
-        When there is no such score.
+        When there is no such score, or it cannot rank sites.
     MissingBackendError
-        When it cannot be loaded, or can rank no sites.
+        When it cannot be loaded.
     """
     score = plugins.load_plugin(SCORES_GROUP, name)
     if not isinstance(score, VehicleScore):
-        expected = f"{VehicleScore.__module__}.{VehicleScore.__name__}"
-        problem = f"only a {expected} can rank sites, got a {type(score).__name__}"
-        raise plugins.plugin_error(SCORES_GROUP, name, problem)
+        problem = f"{name!r} is a {type(score).__name__}, which cannot rank sites"
+        hint = f"Use an {VehicleScore.__module__}.{VehicleScore.__name__}; egvs validate compares other scores."
+        raise InputError("score.rank_by", problem, hint)
     if score.name != name:
         problem = f"expected the name {name!r} of its entry point, got {score.name!r}"
         raise plugins.plugin_error(SCORES_GROUP, name, problem)

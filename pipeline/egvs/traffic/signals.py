@@ -278,7 +278,8 @@ def read_signals(path: Path, roads: network.Network) -> tuple[Signal, ...]:
             elif element.tag == "edge" and element.get("function") == "crossing":
                 parts.crossings.add(element.attrib["id"])
         except (KeyError, ValueError) as error:
-            raise InputError(path, f"invalid <{element.tag}> of a signal ({error!r})", "Use netconvert.") from None
+            problem = f"{error} is missing" if isinstance(error, KeyError) else error
+            raise InputError(path, f"invalid <{element.tag}> of a signal ({problem})", "Use netconvert.") from None
     by_signal: dict[str, list[dict[str, str]]] = {}
     for connection in parts.connections:
         by_signal.setdefault(connection["tl"], []).append(connection)

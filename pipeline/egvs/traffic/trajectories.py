@@ -537,6 +537,8 @@ def traffic_warnings(
             " here"
         )
         hint = "Enlarge the junction, or use signals where vehicles wait on it to give way."
+        if recording.tracks is not None:
+            hint = "Check times, positions and sizes of the tracks."
         if statistics.twins is not None and statistics.same_place >= MIN_TWIN_SHARE * statistics.overlapping_pairs:
             where = recording.where
             same_place = format_percent(statistics.same_place / statistics.overlapping_pairs, 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import io
 import json
+import re
 import subprocess
 import sys
 import time
@@ -95,6 +96,7 @@ def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:
     plan = desk.ok("GET", "/api/plan")
     assert (len(plan["sensors"]), plan["requested"]) == (2, {"count": 2})
     assert 0.9 < plan["certificate"] <= 1
+    assert all(sensor["adds_text"] for sensor in plan["sensors"])
     desk.ok("POST", "/api/plan", {"count": 99})
     assert "at most" in desk.wait("failed")["message"]
 
@@ -127,11 +129,19 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         desk.wait()
         assert desk.project["run"]["state"] == "complete"
 
-        desk.ok("PATCH", "/api/sites/pole_a", {"x_m": 11})
+        move = {"x_m": 11, "keep_results": True}
+        status, message, field = desk.refused("PATCH", "/api/sites/pole_a", dict(move))
+        assert (status, field) == (409, "keep_results") and "present poles and counts" in message
+        assert (desk.project["run"]["state"], desk.project["undo"]) == ("complete", None)
+        desk.ok("PATCH", "/api/sites/pole_a", {"must_not": True, "keep_results": True})  # no score depends on it
+        desk.ok("POST", "/api/undo", {"keep_results": True})
+        desk.ok("PATCH", "/api/sites/pole_a", {**move, "keep_results": False})
         assert desk.project["run"]["state"] == "outdated"
         assert desk.ok("GET", "/api/ranking")["outdated"]
-        desk.ok("POST", "/api/undo", {})
+        desk.ok("POST", "/api/undo", {"keep_results": True})
         assert desk.project["run"]["state"] == "complete"
+        desk.ok("POST", "/api/redo", {"keep_results": True})  # that was agreed to
+        desk.ok("POST", "/api/undo", {})
 
         desk.ok("PATCH", "/api/sites/pole_b", {"must": True})
         assert desk.project["run"]["state"] == "complete"
@@ -149,8 +159,25 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         desk.wait()
         assert [each["pole"] for each in desk.ok("GET", "/api/plan")["sensors"]] == ["pole_b"]
         assert not desk.project["run"]["plan_outdated"]
+        (adds,) = desk.ok("GET", "/api/plan")["sensors"][0]["adds_text"]
+        assert re.fullmatch(r"Vehicles that only this sensor finds: \d+ % of all vehicles\.", adds)
+        desk.ok("POST", "/api/additions", {})
+        desk.wait()
+        assert desk.ok("GET", "/api/plan")["sensors"][0]["adds_text"] == [adds]
+
+        digest = desk.project["files"]
+        desk.ok("POST", "/api/trial", {"site": "pole_b", "sensor": "VLP-16"})
+        tried = desk.wait()["result"]
+        assert (tried["site"], tried["sensor"], tried["label"]) == ("pole_b", "VLP-16", "EGVS")
+        assert re.fullmatch(r"\+[\d,]+ bit", tried["change_text"]) and tried["before_text"] != tried["after_text"]
+        desk.ok("POST", "/api/trial", {"site": "pole_a", "sensor": "VLP-16"})
+        assert "sensors are these already" in desk.wait("failed")["message"]
+        assert desk.refused("POST", "/api/trial", {"site": "pole_b", "sensor": "none"})[::2] == (422, "sensor")
+        assert desk.refused("POST", "/api/trial", {"site": "pole_c", "sensor": "VLP-16"})[0] == 404
+        assert desk.project["files"] == digest
         desk.ok("PATCH", "/api/sites/pole_b", {"must": False})
         assert desk.project["run"]["plan_outdated"]
+        assert desk.refused("POST", "/api/trial", {"site": "pole_b", "sensor": "VLP-16"})[0] == 409
 
         before = (tmp_path / "work" / "runs" / "mini" / "scores.parquet").read_bytes()
         for number in range(3):

@@ -210,7 +210,7 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
     tab.get_by_role("button", name="Make the scenario").click()
 
     tab.get_by_role("button", name="signal1").click(timeout=JOB_MS)
-    assert credit.is_visible()
+    credit.wait_for()
     assert "signal mast" in tab.get_by_role("region", name="Pole signal1").inner_text()
     type_into(tab, "Height", "4,5")
     wait_until(tab, lambda: site(tab, "signal1")["z_m"] == 4.5)
@@ -375,12 +375,75 @@ def test_plan_that_cannot_be_is_explained(finished: Any) -> None:
     type_into(tab, "Budget", "ten")
     tab.get_by_text("“ten” is not a number.").wait_for()
     type_into(tab, "A sensor costs", "100")
-    wait_until(tab, lambda: state(tab)["project"]["costs"]["sensor_cost"] == 100)
+    wait_until(tab, lambda: state(tab)["project"]["costs"]["sensor_costs"] == {"small": 100})
     type_into(tab, "Budget", "5")
     tab.get_by_role("button", name="Find the best plan").click()
     message = tab.locator("#message.error")
     message.wait_for(timeout=JOB_MS)
     assert "budget" in message.inner_text()
+
+    slider = tab.get_by_role("slider", name="Budget from the cheapest to the dearest plan")
+    slider.press("Home")
+    slider.press("ArrowRight")
+    assert tab.get_by_label("Budget", exact=True).input_value() == "105"
+    slider.press("End")
+    assert slider.get_attribute("aria-valuetext") == "200"
+    tab.get_by_role("button", name="Find the best plan").click()
+    tab.get_by_text("Costs 200.").wait_for(timeout=JOB_MS)
+    slider.press("Home")
+    tab.get_by_text("Costs 100.").wait_for(timeout=JOB_MS)
+    assert_accessible(tab)
+
+
+def test_results_are_kept_until_a_change_is_agreed_to(finished: Any, folder: Path) -> None:
+    tab, sites = finished, folder / "mini" / "sites.csv"
+    before = sites.read_text()
+    tab.get_by_role("button", name="Find the best 2 poles").click()
+    tab.get_by_text("Vehicles that only this sensor finds").first.wait_for(timeout=JOB_MS)
+    assert tab.get_by_role("button", name="Try it").is_disabled()  # no sensor is chosen
+    tab.get_by_label("Pole", exact=True).select_option("pole_b")
+    tab.get_by_label("Sensor to try").select_option("VLP-16")
+    tab.get_by_role("button", name="Try it").click()
+    tab.locator("#panel").get_by_text("With VLP-16 on pole_b").wait_for(timeout=JOB_MS)
+    assert_accessible(tab)
+    assert sites.read_text() == before
+
+    dialog = tab.get_by_role("dialog", name="The results will be out of date")
+    tab.get_by_role("button", name="Write it to the list of poles").click()
+    dialog.wait_for()
+    assert has_focus(tab, "Keep the results")
+    assert violations(tab) == []
+    tab.keyboard.press("Escape")
+    dialog.wait_for(state="detached")
+    wait_until(tab, partial(has_focus, tab, "Write it to the list of poles"))
+    assert (sites.read_text(), state(tab)["project"]["run"]["state"]) == (before, "complete")
+    tab.keyboard.press("Enter")
+    dialog.get_by_role("button", name="Change").click()
+    tab.get_by_text("pole_b has the sensor VLP-16 now.").wait_for()
+    assert "pole_b,30.5,-12,3,VLP-16" in sites.read_text()
+    assert state(tab)["project"]["run"]["state"] == "outdated"
+    tab.get_by_role("button", name="Undo").click()
+    wait_until(tab, lambda: state(tab)["project"]["run"]["state"] == "complete")
+    go(tab, "Poles")
+    tab.get_by_role("button", name="pole_a").click()
+    type_into(tab, "Height", "5")
+    wait_until(tab, lambda: site(tab, "pole_a")["z_m"] == 5)  # it is asked once
+
+
+def test_change_that_is_not_agreed_to_is_taken_back(finished: Any) -> None:
+    tab = finished
+    go(tab, "Poles")
+    tab.get_by_role("button", name="pole_a").click()
+    keep = tab.get_by_role("button", name="Keep the results")
+    type_into(tab, "Height", "5")
+    keep.click()
+    wait_until(tab, lambda: tab.get_by_label("Height", exact=True).input_value() == "3")
+    x, y = pixel(tab, "pole_a")
+    drag(tab, (x, y), (x + 20, y))
+    keep.click()
+    wait_until(tab, lambda: pixel(tab, "pole_a") == (x, y))
+    assert site(tab, "pole_a")["z_m"] == 3
+    assert tab.get_by_role("button", name="Undo").is_disabled()
 
 
 def test_signal_times_are_typed_and_checked(town: Any) -> None:

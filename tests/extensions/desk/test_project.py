@@ -11,6 +11,7 @@ import pytest
 from egvs.extensions.desk.project import CsvTable
 from egvs.extensions.desk.refusals import RefusalError, parse_number
 from egvs.scenario.loading import load
+from egvs.sensors.sites import candidate_sites
 from tests.extensions.desk.serving import Client
 
 pytestmark = pytest.mark.system  # a junction is made from a map
@@ -54,7 +55,6 @@ def test_shows_poles_of_the_map_first(town: Client) -> None:
         ("lamp1", "lamp", True),
     ]
     assert project["sites_editable"] and project["counts_editable"]
-    assert 51.99 < project["origin"]["lat_deg"] < 52.01
 
 
 def test_shows_the_map(town: Client) -> None:
@@ -187,6 +187,29 @@ def test_settings_keep_comments(town: Client, tmp_path: Path) -> None:
     assert "# assumed. Replace it by the real plan" in read(tmp_path, "scenario.toml")
     for body in ({"frames": 0.5}, {"frames": -1}, {"sensor": "x"}, {"extends": "/etc"}, {"heights_m": []}):
         assert town.refused("PUT", "/api/settings", body)[0] == 422
+
+
+def test_costs_say_what_plans_cost(town: Client, tmp_path: Path) -> None:
+    sensor = town.project["mounts"]["sensor"]
+    assert town.project["costs"] == {"pole_cost": 0, "sensor_costs": {sensor: None}, "least": None, "most": None}
+    town.ok("POST", "/api/sites", {"x_m": 211, "y_m": 211})
+    town.ok("PUT", "/api/settings", {"pole_cost": 500, "sensor_costs": {sensor: "8000"}})
+    assert town.project["costs"] == {"pole_cost": 500, "sensor_costs": {sensor: 8000}, "least": 8000, "most": 24_500}
+    town.ok("PATCH", "/api/sites/lamp1", {"sensor": "OS1-128"})
+    costs = town.project["costs"]
+    assert (costs["sensor_costs"], costs["least"]) == ({sensor: 8000, "OS1-128": None}, None)  # one is not known
+    town.ok("PUT", "/api/settings", {"sensor_costs": {"OS1-128": 15_000}})
+    town.ok("PATCH", "/api/sites/new1", {"must_not": True})
+    assert (town.project["costs"]["least"], town.project["costs"]["most"]) == (8000, 23_000)
+    for wrong in ({"none": 1}, {sensor: "dear"}, {sensor: -1}, 5):
+        assert town.refused("PUT", "/api/settings", {"sensor_costs": wrong})[0] == 422
+
+
+def test_last_pole_takes_the_sensor_of_all_along(town: Client, tmp_path: Path) -> None:
+    for name in ("signal1", "lamp1"):
+        town.ok("PATCH", f"/api/sites/{name}", {"sensor": "OS1-128"})
+    assert town.project["mounts"]["sensor"] == "OS1-128"
+    assert {each.sensor for each in candidate_sites(load(tmp_path / "work" / "town"))} == {"OS1-128"}
 
 
 def test_undo_and_redo_restore_every_byte(town: Client, tmp_path: Path) -> None:

@@ -172,6 +172,8 @@ def build_network(
                 raise no_streets from None
             if isinstance(error, sumo.SumoInputError):
                 raise error.for_input(osm, "netconvert cannot use the streets", "Choose another extract.") from None
+            if isinstance(error, InputError):
+                raise junctions.unusable_network(error, folder / NETWORK_FILE, osm) from None
             raise
         text = (folder / NETWORK_FILE).read_text(encoding="utf-8")
 

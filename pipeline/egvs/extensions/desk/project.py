@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import json
 import math
 import re
 import shutil
@@ -19,7 +20,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tomlkit
 
 from egvs.artefacts.run_folder import RUNS, RunFolder
@@ -46,9 +46,11 @@ _OPTIONAL_NUMBERS = {"z_m": (-500.0, 10_000.0), "yaw_deg": (-360.0, 360.0), "pit
 _SETTINGS = {
     "frames": ("traffic", "frames"), "warmup_s": ("traffic", "warmup_s"), "seed": ("seed",),
     "sensor": ("sites", "sensor"), "heights_m": ("sites", "heights_m"), "pitch_deg": ("sites", "pitch_deg"),
-    "pole_cost": ("costs", "pole"), "sensor_cost": ("costs", "sensor"),
+    "pole_cost": ("costs", "pole"), "sensor_costs": ("costs", "sensor"),
 }  # fmt: skip
 _WHOLE = ("frames", "seed")
+KEEP_RESULTS = "keep_results"
+"""Key of a change that says whether the results of the run have to stay current (:meth:`Project.protect_results`)."""
 _OF_MAP_NAME = re.compile(r"(lamp|signal|pole)\d+")
 
 
@@ -139,12 +141,14 @@ class Project:
         self._undo: list[Step] = []
         self._redo: list[Step] = []
         self._scenario = load(self.folder)
+        self._candidates: tuple[Scenario | None, tuple[sites.Site, ...]] = (None, ())
         self._problem = ""
         self._contents = self._read()
         if SCENARIO_FILE not in self._contents:
             raise RefusalError(409, f"{SCENARIO_FILE} is a link to another folder", "Open that folder.", "scenario")
         self._kept_scene: _Scene | None = None
         self._run_state: tuple[object, dict[str, Any]] = (None, {})
+        self._protects, self._given_up = False, 0
 
     # ---- files
 
@@ -175,9 +179,7 @@ class Project:
                 if present == self._contents:
                     return False
                 self._note_step("changes on disk", present)
-                scenario = load(self.folder)
-                sites.candidate_sites(scenario)
-                self._scenario, self._problem = scenario, ""
+                self._scenario, self._problem = self._load(), ""
             except (EgvsError, OSError, ValueError) as error:
                 changed, self._problem = str(error) != self._problem, str(error)
                 return changed
@@ -189,6 +191,28 @@ class Project:
         self._undo.append(Step(label, before, {name: after.get(name, "") for name in names}))
         self._redo.clear()
         self._contents = after
+
+    def _load(self) -> Scenario:
+        scenario = load(self.folder)
+        self._candidates = scenario, sites.candidate_sites(scenario)
+        return scenario
+
+    def protect_results(self, keep: object) -> None:
+        """Say whether the next change may make the results of the run out of date.
+
+        True refuses it if it would be the first one that does. False agrees to that, until there are other results.
+        """
+        scores = RunFolder(self.run_folder).scores
+        results = scores.stat().st_mtime_ns if scores.is_file() else 0
+        if keep is False:
+            self._given_up = results
+        self._protects = keep is True and self._given_up != results and self.run_state()["state"] == "complete"
+
+    def _check_results_stay(self, scenario: Scenario) -> None:
+        if self._protects and results_view.describe_run(self.run_folder, scenario)["state"] != "complete":
+            problem = "The results are about the present poles and counts."
+            hint = "After this change they are out of date until the next run."
+            raise RefusalError(409, problem, hint, KEEP_RESULTS)
 
     def _write(self, contents: Contents) -> None:
         for name, text in contents.items():
@@ -202,8 +226,11 @@ class Project:
         before = {name: self._contents[name] for name in changed}
         try:
             self._write(changed)
-            scenario = load(self.folder)
-            sites.candidate_sites(scenario)
+            scenario = self._load()
+            self._check_results_stay(scenario)
+        except RefusalError:
+            self._write(before)
+            raise
         except EgvsError as error:
             self._write(before)
             refusal = RefusalError.of(error, field_name)
@@ -225,16 +252,19 @@ class Project:
             self.refresh()
             if not source:
                 raise RefusalError(409, f"There is nothing to {'undo' if is_undo else 'redo'}.")
-            step = source.pop()
+            step = source[-1]
             self._write(step.before if is_undo else step.after)
-            target.append(step)
-            self._contents = self._read()
             try:
-                scenario = load(self.folder)
-                sites.candidate_sites(scenario)
+                scenario = self._load()
+                self._check_results_stay(scenario)
                 self._scenario, self._problem = scenario, ""
+            except RefusalError:
+                self._write(step.after if is_undo else step.before)
+                raise
             except EgvsError as error:  # the step was an edit by hand
                 self._problem = str(error)
+            target.append(source.pop())
+            self._contents = self._read()
 
     # ---- poles
 
@@ -273,9 +303,7 @@ class Project:
     def edit_site(self, name: str, body: dict[str, Any]) -> None:
         """Change a pole: position, sensor, cost, its name, and whether it exists, must or must not be used."""
         with self.lock:
-            table, rows = self._sites_table()
-            if name not in rows:
-                raise RefusalError(404, f"there is no pole {name!r}")
+            table, rows = self._table_with(name)
             row, document = rows[name], tomlkit.parse(self._contents[SCENARIO_FILE])
             is_moved = "x_m" in body or "y_m" in body
             if is_moved:
@@ -289,6 +317,8 @@ class Project:
             self._fill(table, row, {key: value for key, value in body.items() if key not in ("site", *_FLAGS)})
             row["site"] = new_name
             self._set_flags(document, name, new_name, body, row)
+            if (default := self._default_sensor(table)) != self._scenario.sites.sensor:
+                document["sites"]["sensor"] = default
             after = {**self._contents, self.sites_file: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
             label = f"{'move' if is_moved and len(body) <= 2 else 'edit'} {name}"
             self._change(label, after, "site" if new_name != name else next(iter(body), ""))
@@ -296,14 +326,25 @@ class Project:
     def remove_site(self, name: str) -> None:
         """Remove a pole."""
         with self.lock:
-            table, rows = self._sites_table()
-            if name not in rows:
-                raise RefusalError(404, f"there is no pole {name!r}")
+            table, rows = self._table_with(name)
             table.rows.remove(rows[name])
             document = tomlkit.parse(self._contents[SCENARIO_FILE])
             self._set_flags(document, name, name, dict.fromkeys(_FLAGS, False), {})
             after = {**self._contents, self.sites_file: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
             self._change(f"remove {name}", after)
+
+    def exchange_sensor(self, name: str, sensor: str, file: Path) -> list[str]:
+        """Write the table of poles with another sensor on one of them to a file; return the settings that use it."""
+        with self.lock:
+            table, rows = self._table_with(name)
+            self._fill(table, rows[name], {"sensor": sensor})
+            files.write_text(file, table.to_text())
+            return [f"sites.file={json.dumps(str(file))}", f"sites.sensor={json.dumps(self._default_sensor(table))}"]
+
+    def _default_sensor(self, table: CsvTable) -> str:
+        """Return the sensor of ``[sites]``; that of the first pole where no pole has it any more."""
+        sensors = [row.get("sensor") or self._scenario.sites.sensor for row in table.rows]
+        return self._scenario.sites.sensor if self._scenario.sites.sensor in sensors else sensors[0]
 
     @property
     def sites_file(self) -> str:
@@ -340,6 +381,13 @@ class Project:
                 raise RefusalError(409, reason)
         table = CsvTable.parse(self._contents.get(self.sites_file, ""))
         return table, {row.get("site", "").strip(): row for row in table.rows}
+
+    def _table_with(self, name: str) -> tuple[CsvTable, dict[str, dict[str, str]]]:
+        """Return the table of sites, which has this one, and its rows by name."""
+        table, rows = self._sites_table()
+        if name not in rows:
+            raise RefusalError(404, f"there is no pole {name!r}")
+        return table, rows
 
     def _fill(self, table: CsvTable, row: dict[str, str], values: dict[str, Any]) -> None:
         for key, value in values.items():
@@ -482,12 +530,17 @@ class Project:
         if key in ("heights_m", "pitch_deg"):
             values = value if isinstance(value, list) else [value]
             return ["aim" if each == "aim" and key == "pitch_deg" else parse_number(each, key) for each in values]
+        if key == "sensor_costs" and isinstance(value, dict):
+            if unknown := set(value) - set(self._sensor_names()):
+                raise RefusalError(422, f"there is no sensor {min(unknown)[:40]!r}", "", key)
+            given = {name: parse_number(cost, key, 0.0) for name, cost in value.items()}
+            return {**self._scenario.costs.sensor, **given}
         number = parse_number(value, key, 0.0)
         if key in _WHOLE:
             if number != int(number):
                 raise RefusalError(422, f"expected a whole number, got {value!r}", "", key)
             return int(number)
-        return {self._scenario.sites.sensor: number} if key == "sensor_cost" else number
+        return number
 
     def _sensor_names(self) -> list[str]:
         return [*self._scenario.sensors, *CATALOGUE]
@@ -543,19 +596,18 @@ class Project:
             try:
                 traffic = traffic_view.describe_movements(scenario, scene.inputs.network)
                 traffic["signals"] = self._describe_signals()
-                origin = self._origin()
             except EgvsError as error:
-                traffic, origin = {**traffic_view.describe_movements(scenario, None), "signals": []}, None
+                traffic = {**traffic_view.describe_movements(scenario, None), "signals": []}
                 self._problem = self._problem or str(error)
             settings = scenario.traffic
             return {
                 "id": self.identifier, "name": scenario.name, "title": scenario.description or scenario.name,
                 "assumed": list(scenario.assumed), "notes": self.notes, "problem": self._problem,
                 "files": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in self._contents.items()},
-                "roi": {"center_m": scenario.roi.center_m, "size_m": scenario.roi.size_m}, "origin": origin,
+                "roi": {"center_m": scenario.roi.center_m, "size_m": scenario.roi.size_m},
                 "map_key": scene.key,
                 "mounts": {
-                    "sensor": config.sensor, "heights_m": list(config.heights_m or ()), "aim": config.aim,
+                    "sensor": config.sensor, "heights_m": list(config.heights_m or ()),
                     "pitch_deg": list(config.pitch_deg) if isinstance(config.pitch_deg, tuple) else [config.pitch_deg],
                 },
                 "sensors": self._sensor_names(),
@@ -568,21 +620,11 @@ class Project:
                     "warmup_s": settings.warmup_s, "seed": scenario.seed,
                     "traffic_s": None if settings.frames is None else settings.frames * settings.frame_period_s,
                 },
-                "costs": {
-                    "pole_cost": scenario.costs.pole,
-                    "sensor_cost": scenario.costs.sensor.get(config.sensor),
-                },
+                "costs": results_view.describe_costs(scenario, self._read_candidates()),
                 "run": {"id": self.run_folder.name, **self.run_state()},
                 "undo": self._undo[-1].label if self._undo else None,
                 "redo": self._redo[-1].label if self._redo else None,
             }  # fmt: skip
-
-    def _origin(self) -> dict[str, float] | None:
-        frame = geolocation.scenario_georeference(self._scenario).frame
-        if frame is None:
-            return None
-        ((lon_deg, lat_deg),) = frame.to_degrees(np.array([self._scenario.roi.center_m[:2]])).tolist()
-        return {"lat_deg": lat_deg, "lon_deg": lon_deg}
 
     def _describe_sites(self) -> list[dict[str, Any]]:
         placement, existing = self._scenario.placement, self._scenario.sites.existing_poles
@@ -599,16 +641,26 @@ class Project:
             })  # fmt: skip
         return described
 
+    def _read_candidates(self) -> tuple[sites.Site, ...]:
+        """Return the candidates of the scenario; none where they cannot be read."""
+        try:
+            if self._candidates[0] is not self._scenario:
+                self._candidates = self._scenario, sites.candidate_sites(self._scenario)
+        except InputError as error:
+            self._problem = self._problem or str(error)
+            return ()
+        return self._candidates[1]
+
     def _site_rows(self) -> list[dict[str, Any]]:
         """Return the rows of the table, else the poles of the scenario; empty where they cannot be read."""
         try:
             if not self._why_no_sites():
                 world = geolocation.scenario_georeference(self._scenario)
                 return [row.columns for row in site_files.read_table(self.folder / self.sites_file, world)[0]]
-            poles = {each.pole: each for each in sites.candidate_sites(self._scenario)}
         except InputError as error:
             self._problem = self._problem or str(error)
             return []
+        poles = {each.pole: each for each in self._read_candidates()}
         return [{"site": name, "x_m": each.pose.x_m, "y_m": each.pose.y_m} for name, each in poles.items()]
 
 

@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
 from egvs.core.wording import format_percent
-from egvs.results.labels import ScoreLabel
+from egvs.placement import problem_builder
 from egvs.results.plans import SensorPlan
-from egvs.results.ranking import RankedSite, Ranking, describe_mount
+from egvs.results.ranking import Ranking, describe_mount
 from egvs.runs import run_sources
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import PlacementConfig
+from egvs.sensors.sites import Site
 
 _NO_SCORES = ("placement", "costs", "what_if")
 """Beginnings of the keys of settings on which no score depends."""
+
+
+MOST_SENSORS = 12
+"""Sensors of the dearest plan that a budget is offered for."""
 
 
 def describe_run(folder: Path, scenario: Scenario) -> dict[str, Any]:
@@ -54,50 +61,54 @@ def _placement_rules(placement: Mapping[str, Any]) -> dict[str, Any]:
     return config.model_dump(exclude={"refine"})
 
 
+def describe_costs(scenario: Scenario, candidates: Sequence[Site]) -> dict[str, Any]:
+    """Return what is paid for poles and sensors, and for the cheapest and the dearest plan; None where unknown."""
+    sensor_costs = {site.sensor: scenario.costs.sensor.get(site.sensor) for site in candidates}
+    costs = {"pole_cost": scenario.costs.pole, "sensor_costs": sensor_costs, "least": None, "most": None}
+    try:
+        rules = problem_builder.rules_from_config(scenario, candidates)
+    except InputError:  # such as a cost that is not given
+        return costs
+    paid = np.where(rules.excluded, 0.0, rules.cost)
+    if paid.any():
+        of_poles = [paid[rules.pole == pole].max() for pole in np.unique(rules.pole)]
+        costs |= {"least": float(paid[paid > 0.0].min()), "most": float(sum(sorted(of_poles)[-MOST_SENSORS:]))}
+    return costs
+
+
 def describe_ranking(folder: Path) -> dict[str, Any]:
     """Return the ranking of a run."""
     ranking = Ranking.read(RunFolder(folder).scores)
     by = ranking.by
-    sites = [_describe_site(site, by) for site in ranking.sites]
     poles = []
     for rank, pole in enumerate(ranking.poles, start=1):
-        best = _describe_site(pole.best, by)
-        poles.append({**best, "pole": pole.name, "rank": rank, "mount_text": describe_mount(pole.best)})
-    return {"label": by.head, "unit": "%" if by.is_share else by.unit, "poles": poles,
-            "sites": sites}  # fmt: skip
+        best = pole.best
+        se = math.nan if best.score_se is None else best.score_se
+        poles.append({
+            "rank": rank, "pole": pole.name, "site": best.site, "mount_text": describe_mount(best),
+            "score": _finite(best.score), "score_text": by.with_unit(best.score, se),
+        })  # fmt: skip
+    return {"label": by.head, "poles": poles}
 
 
-def _describe_site(site: RankedSite, by: ScoreLabel) -> dict[str, Any]:
-    se = math.nan if site.score_se is None else site.score_se
-    return {
-        "rank": site.rank, "site": site.site, "pole": site.pole, "x_m": site.x_m, "y_m": site.y_m, "z_m": site.z_m,
-        "yaw_deg": site.yaw_deg, "pitch_deg": site.pitch_deg, "sensor": site.sensor, "score": _finite(site.score),
-        "score_text": by.with_unit(site.score, se),
-    }  # fmt: skip
-
-
-def describe_plan(folder: Path) -> dict[str, Any] | None:
-    """Return the plan of a run; None without one."""
+def describe_plan(folder: Path, adds: Mapping[str, list[str]]) -> dict[str, Any] | None:
+    """Return the plan of a run, with sentences on what each sensor ``adds``, by its site; None without a plan."""
     plan = SensorPlan.read(RunFolder(folder))
     if plan is None:
         return None
     by = plan.by
     sensors = [
         {
-            "order": each.order, "site": each.site, "pole": each.pole, "x_m": each.x_m, "y_m": each.y_m,
-            "z_m": each.z_m, "yaw_deg": each.yaw_deg, "pitch_deg": each.pitch_deg, "sensor": each.sensor,
-            "gain_text": by.change(each.gain, each.gain_se), "score_text": by.with_unit(each.score, each.score_se),
-            "loss_text": by.change(each.loss), "cost": each.cost, "forced": each.forced,
+            "order": each.order, "site": each.site, "pole": each.pole, "z_m": each.z_m, "pitch_deg": each.pitch_deg,
+            "sensor": each.sensor, "cost": each.cost, "forced": each.forced, "adds_text": adds.get(each.site, []),
+            "gain_text": by.change(each.gain, each.gain_se), "loss_text": by.change(each.loss),
         }
         for each in plan.sensors
     ]  # fmt: skip
     curve = [
-        {
-            "count": step.count, "score": _finite(step.score), "score_text": by.with_unit(step.score, step.score_se),
-            "sites": list(step.sites), "cost": step.cost,
-        }
+        {"count": step.count, "score": _finite(step.score), "score_text": by.with_unit(step.score, step.score_se)}
         for step in plan.curve
-    ]  # fmt: skip
+    ]
     proof = "proved to be the best plan" if plan.is_best else (
         f"at least {format_percent(math.floor(plan.certificate * 1000) / 1000)} of the best possible score, proved"
     )  # fmt: skip

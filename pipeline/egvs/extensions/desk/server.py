@@ -9,11 +9,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import math
 import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,14 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from egvs.artefacts.run_folder import RunFolder
 from egvs.core.errors import EgvsError
+from egvs.core.numbers import number_or_nan
 from egvs.creation.assumed_traffic import TRAFFIC_LEVELS
 from egvs.extensions.desk import downloads, obstacles, results_view
 from egvs.extensions.desk.events import Events
 from egvs.extensions.desk.jobs import Job, LiveScores
-from egvs.extensions.desk.project import Project
+from egvs.extensions.desk.project import KEEP_RESULTS, Project
 from egvs.extensions.desk.refusals import RefusalError, parse_number, require_text
 from egvs.extensions.desk.workspace import DroppedMap, Workspace, map_suffixes
 
@@ -67,6 +70,7 @@ class Desk:
         self._revision = 0
         self._three: tuple[Path, subprocess.Popen[str], str] | None = None
         self._what_if: tuple[str, Answer] | None = None
+        self._additions: tuple[object, dict[str, list[str]]] = (None, {})
         self._lock = threading.RLock()
 
     def close(self) -> None:
@@ -112,18 +116,19 @@ class Desk:
         """Open a scenario."""
         return self._open(require_text(body, "scenario"))
 
-    def _open(self, identifier: str, notes: list[str] | None = None) -> Answer:
+    def _open(self, identifier: str) -> Answer:
         with self._lock:
             self._refuse_while_running()
-            folder = self.workspace.scenario_folder(identifier)
-            name = folder.name
-            self._project = Project(identifier, folder, self.workspace.run_folder(name), notes or [])
-            named = self._project.scenario.name
-            if named != name:
-                self._project.run_folder = self.workspace.run_folder(named)
-            self._live.close()
-            self._publish_state()
+            self._open_project(identifier)
             return self.state({})
+
+    def _open_project(self, identifier: str, notes: Sequence[str] = ()) -> None:
+        folder = self.workspace.scenario_folder(identifier)
+        project = Project(identifier, folder, self.workspace.run_folder(folder.name), list(notes))
+        project.run_folder = self.workspace.run_folder(project.scenario.name)
+        self._project = project
+        self._live.close()
+        self._publish_state()
 
     def copy(self, body: Body) -> Answer:
         """Copy a shipped scenario, and open it."""
@@ -185,11 +190,8 @@ class Desk:
         folder = self.workspace.new_folder(name)
         at = None
         if body.get("at") is not None:
-            parts = str(body["at"]).split(",")
-            if len(parts) != 2:
-                raise RefusalError(422, "expected two numbers", "Choose a junction.", "at")
-            at = [parse_number(float(part), "at") for part in parts if _is_float(part)]
-            if len(at) != 2:
+            at = [number_or_nan(part) for part in str(body["at"]).split(",")]
+            if len(at) != 2 or not all(map(math.isfinite, at)):
                 raise RefusalError(422, "expected two numbers", "Choose a junction.", "at")
         poles, traffic = body.get("poles", "existing"), body.get("traffic", "medium")
         if poles not in ("existing", "kerbs"):
@@ -198,7 +200,7 @@ class Desk:
             raise RefusalError(422, f"expected one of {', '.join(TRAFFIC_LEVELS)}", "", "traffic")
 
         def finish(result: Answer) -> Answer:
-            self._open_after_job(name, result["notes"])
+            self._open_project(name, result["notes"])
             return result
 
         request = {
@@ -207,16 +209,12 @@ class Desk:
         }  # fmt: skip
         return self._start_job("new", f"New scenario {name}", request, finish)
 
-    def _open_after_job(self, identifier: str, notes: list[str]) -> None:
-        folder = self.workspace.scenario_folder(identifier)
-        self._project = Project(identifier, folder, self.workspace.run_folder(identifier), notes)
-        self._publish_state()
-
     # ---- changes
 
-    def _changed(self, change: Callable[[], object]) -> Answer:
+    def _changed(self, body: Body, change: Callable[[], object]) -> Answer:
         with self._lock:
             self._refuse_while_running()
+            self.project.protect_results(body.pop(KEEP_RESULTS, None))
             change()
             self._publish_state()
             return self.state({})
@@ -224,16 +222,16 @@ class Desk:
     def add_site(self, body: Body) -> Answer:
         """Add a pole."""
         names: list[str] = []
-        answer = self._changed(lambda: names.append(self.project.add_site(body)))
+        answer = self._changed(body, lambda: names.append(self.project.add_site(body)))
         return {**answer, "site": names[0]}
 
     def edit_site(self, body: Body, name: str) -> Answer:
         """Change a pole."""
-        return self._changed(lambda: self.project.edit_site(name, body))
+        return self._changed(body, lambda: self.project.edit_site(name, body))
 
-    def remove_site(self, _body: Body, name: str) -> Answer:
+    def remove_site(self, body: Body, name: str) -> Answer:
         """Remove a pole."""
-        return self._changed(lambda: self.project.remove_site(name))
+        return self._changed(body, lambda: self.project.remove_site(name))
 
     def check_site(self, body: Body) -> Answer:
         """Say whether a pole can stand somewhere."""
@@ -242,27 +240,27 @@ class Desk:
 
     def set_counts(self, body: Body) -> Answer:
         """Set counts."""
-        return self._changed(lambda: self.project.set_counts(body))
+        return self._changed(body, lambda: self.project.set_counts(body))
 
     def set_signals(self, body: Body) -> Answer:
         """Set the times of a signal."""
-        return self._changed(lambda: self.project.set_signals(body))
+        return self._changed(body, lambda: self.project.set_signals(body))
 
     def set_obstacles(self, body: Body) -> Answer:
         """Set what could stand in the way."""
-        return self._changed(lambda: self.project.set_obstacles(body))
+        return self._changed(body, lambda: self.project.set_obstacles(body))
 
     def set_settings(self, body: Body) -> Answer:
         """Set keys of the scenario."""
-        return self._changed(lambda: self.project.set_settings(body))
+        return self._changed(body, lambda: self.project.set_settings(body))
 
-    def undo(self, _body: Body) -> Answer:
+    def undo(self, body: Body) -> Answer:
         """Undo the last change."""
-        return self._changed(self.project.step_back)
+        return self._changed(body, self.project.step_back)
 
-    def redo(self, _body: Body) -> Answer:
+    def redo(self, body: Body) -> Answer:
         """Do it again."""
-        return self._changed(self.project.step_forward)
+        return self._changed(body, self.project.step_forward)
 
     def show_scene(self, _body: Body) -> Answer:
         """Return the map around the junction."""
@@ -310,7 +308,11 @@ class Desk:
         self._publish_state()
         return {"job": self._job.to_json()}
 
-    def _finish_results(self, result: Answer) -> Answer:
+    @property
+    def _folders(self) -> Answer:
+        return {"scenario": str(self.project.folder), "run": str(self.project.run_folder)}
+
+    def _finish_run(self, result: Answer) -> Answer:
         self._publish_state()
         return result
 
@@ -318,8 +320,7 @@ class Desk:
         """Run all stages; continues a run that was stopped."""
         self._live.close()
         self._close_three()
-        request = {"scenario": str(self.project.folder), "run": str(self.project.run_folder)}
-        return self._start_job("run", "Run", request, self._finish_results)
+        return self._start_job("run", "Run", self._folders, self._finish_run)
 
     def plan(self, body: Body) -> Answer:
         """Plan several sensors."""
@@ -330,11 +331,38 @@ class Desk:
         number = parse_number(body[key], key, 1.0 if key == "count" else 0.01, 1000.0 if key == "count" else 1e9)
         if key == "count" and number != int(number):
             raise RefusalError(422, "expected a whole number of sensors", "", key)
-        request = {
-            "scenario": str(self.project.folder), "run": str(self.project.run_folder),
-            "request": [f"placement.{key}={number:.12g}"],
-        }  # fmt: skip
-        return self._start_job("plan", "Plan", request, self._finish_results)
+        request = {**self._folders, "request": [f"placement.{key}={number:.12g}"]}
+        return self._start_job("plan", "Plan", request, self._finish_plan)
+
+    def _finish_plan(self, result: Answer) -> Answer:
+        self._additions = self._plan_made, result["adds"]
+        return self._finish_run({})
+
+    @property
+    def _plan_made(self) -> tuple[Path, int]:
+        """The file of the plan, and when it was made."""
+        path = RunFolder(self.project.run_folder).placement
+        return path, path.stat().st_mtime_ns if path.is_file() else 0
+
+    def _current_plan(self) -> Answer:
+        """Return what a job about the plan needs; RefusalError if it does not belong to the present files."""
+        self.project.refresh()
+        state = self.project.run_state()
+        if not state["has_plan"] or state["plan_outdated"]:
+            raise RefusalError(409, "There is no plan of the present files.", "Find the plan first.")
+        return self._folders
+
+    def additions(self, _body: Body) -> Answer:
+        """Say what each sensor of a plan adds that was made elsewhere: a job."""
+        return self._start_job("additions", "Compare the sensors", self._current_plan(), self._finish_plan)
+
+    def trial(self, body: Body) -> Answer:
+        """Score the plan with another sensor on one pole: a job, which changes nothing."""
+        request = self._current_plan()
+        site, sensor = require_text(body, "site"), require_text(body, "sensor")
+        settings = self.project.exchange_sensor(site, sensor, self.workspace.scratch / "trial.csv")
+        request |= {"settings": settings}
+        return self._start_job("trial", "Trial", request, lambda result: {**result, "site": site, "sensor": sensor})
 
     def what_if(self, _body: Body) -> Answer:
         """Compare the ranking with that with the obstacles: a job."""
@@ -371,7 +399,8 @@ class Desk:
 
     def show_plan(self, _body: Body) -> Answer:
         """Return the plan."""
-        plan = results_view.describe_plan(self.project.run_folder)
+        made, adds = self._additions
+        plan = results_view.describe_plan(self.project.run_folder, adds if made == self._plan_made else {})
         if plan is None:
             raise RefusalError(404, "There is no plan yet.", "Ask for a number of sensors, or give a budget.")
         return {"outdated": self.project.run_state()["plan_outdated"], **plan}
@@ -471,14 +500,6 @@ class Desk:
 
 
 _POSE = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg")
-
-
-def _is_float(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 # ---- HTTP
@@ -620,6 +641,7 @@ def make_application(desk: Desk) -> Starlette:
         post("/api/run", endpoint(desk.run, 202)), post("/api/stop", endpoint(desk.stop)),
         get("/api/ranking", endpoint(desk.ranking)), post("/api/plan", endpoint(desk.plan, 202)),
         get("/api/plan", endpoint(desk.show_plan)), post("/api/score", endpoint(desk.score)),
+        post("/api/additions", endpoint(desk.additions, 202)), post("/api/trial", endpoint(desk.trial, 202)),
         get("/api/downloads", endpoint(desk.downloads)),
         post("/api/downloads/{identifier}", endpoint(desk.make_download, 202)),
         get("/api/files/{identifier}", download), post("/api/three", endpoint(desk.open_three)),

@@ -14,12 +14,17 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from egvs.core.errors import EgvsError
+from egvs.core.errors import EgvsError, InputError
 from egvs.extensions.desk.refusals import describe_error
+
+if TYPE_CHECKING:
+    from egvs.results.plans import SensorPlan
+    from egvs.stages.base import StageContext
 
 _INTERVAL_S = 0.15
 Send = Callable[[dict[str, Any]], None]
@@ -104,13 +109,63 @@ def run_stages(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
 
 
 def plan(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
-    """Plan several sensors, as ``egvs place``."""
+    """Plan several sensors, as ``egvs place``; then as :func:`describe_additions`."""
     from egvs.placement.plan import place
     from egvs.runs.run_sources import SettingsSource
 
     scenario = SettingsSource.of(Path(request["scenario"])).load_with_request(request["request"])
     place(scenario, request["run"], progress=progress.report, listener=progress.stage_event)
-    return {}
+    return describe_additions(progress, request)
+
+
+def describe_additions(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Say what each sensor of the plan adds."""
+    from egvs.extensions.desk import plan_sensors
+
+    progress.report("compares the sensors", 0, 0)
+    with _open_plan(request) as (context, planned):
+        return {"adds": plan_sensors.describe_additions(context, planned)}
+
+
+def try_sensor(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Score the plan with the sensors of another table of sites."""
+    from egvs.extensions.desk import plan_sensors
+
+    progress.report("scans and scores", 0, 0)
+    with _open_plan(request, request["settings"]) as (context, planned):
+        sensors = {site.name: site.sensor for site in context.scene.sites}
+        if all(sensors[each.site] == each.sensor for each in planned.sensors):
+            raise InputError("the plan", "its sensors are these already", "Choose another sensor for one of its poles.")
+        joint = plan_sensors.joint_score(context, planned)
+    by = planned.by
+    sign = "+" if joint > planned.joint else ""
+    return {
+        "label": by.noun, "before_text": by.with_unit(planned.joint, planned.joint_se),
+        "after_text": by.with_unit(joint),
+        "change_text": f"{sign}{by.change(joint - planned.joint)} {by.change_unit}".rstrip(),
+    }  # fmt: skip
+
+
+@contextmanager
+def _open_plan(request: dict[str, Any], settings: Sequence[str] = ()) -> Iterator[tuple[StageContext, SensorPlan]]:
+    """Open the run of a scenario, and its plan; further settings may change the sensors only."""
+    from egvs.artefacts.run_folder import RunFolder
+    from egvs.artefacts.run_record import RunRecord
+    from egvs.core.digests import use_digests
+    from egvs.results.plans import SensorPlan
+    from egvs.runs import stage_registry
+    from egvs.runs.run import lock_run_folder
+    from egvs.runs.run_context import open_folder
+    from egvs.scenario.loading import load
+
+    folder = Path(request["run"])
+    with lock_run_folder(folder):
+        planned = SensorPlan.read(RunFolder(folder))
+        assert planned is not None, "the plan was removed"
+        recorded = stage_registry.recorded_digests(RunRecord.read(folder))
+        context = open_folder(load(request["scenario"], settings), folder, recorded=recorded)
+        with use_digests(context.inputs.digests):
+            yield context, planned
 
 
 def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
@@ -177,7 +232,7 @@ def rate_poses(send: Send, request: dict[str, Any]) -> dict[str, Any]:
 
 JOBS: dict[str, Callable[[Progress, dict[str, Any]], dict[str, Any]]] = {
     "junctions": list_junctions, "download": download_map, "new": create, "run": run_stages, "plan": plan,
-    "what_if": evaluate_obstacles, "export": run_command,
+    "additions": describe_additions, "trial": try_sensor, "what_if": evaluate_obstacles, "export": run_command,
 }  # fmt: skip
 """What each kind of job calls."""
 

@@ -59,6 +59,14 @@ def test_formats_give_same_points(tmp_path: Path, suffix: str, packed: bool) -> 
     assert not sweep.is_coarse
 
 
+def test_signalling_nan_is_a_missing_return(tmp_path: Path) -> None:
+    made = points()
+    made[5, 2] = np.uint64(0x7FF4_0000_0000_0000).view(np.float64)  # arithmetic with it warns
+    pcd.write(tmp_path / "sweep.pcd", made)
+    (sweep,) = read_sweeps([tmp_path / "sweep.pcd"])
+    assert np.isnan(sweep.points_m).all(axis=1).nonzero()[0].tolist() == [0, 5, 7, 2999]
+
+
 def test_each_array_is_a_sweep(tmp_path: Path) -> None:
     path = tmp_path / "frames.npz"
     np.savez(path, a=points().astype(np.float16), b=np.column_stack([points(), np.ones(3000)]))

@@ -108,6 +108,25 @@ export function keepingFocus(element, rebuild) {
 }
 
 /**
+ * Ask in a dialog. Escape is the same as the second button, which has the focus.
+ * @param {string} title @param {string} text @param {string} yes @param {string} no
+ * @returns {Promise<boolean>}
+ */
+export function ask(title, text, yes, no) {
+  return new Promise((resolve) => {
+    const dialog = h("dialog", { "aria-labelledby": "ask-title", "aria-describedby": "ask-text" },
+      h("h2", { id: "ask-title" }, title), h("p", { id: "ask-text" }, text),
+      h("div.tools", {}, h("button", { type: "button", onclick: () => dialog.close("yes") }, yes), h("button.main", { type: "button", autofocus: true, onclick: () => dialog.close() }, no)));
+    dialog.addEventListener("close", () => {
+      dialog.remove();
+      resolve(dialog.returnValue === "yes");
+    });
+    document.body.append(dialog);
+    dialog.showModal();
+  });
+}
+
+/**
  * Call a function when nothing was requested for a while; `flush` calls it at once.
  * @param {number} delayMs
  * @param {() => void} action

@@ -114,7 +114,7 @@ function shortcuts(event) {
   const isTyping = event.target instanceof HTMLInputElement && event.target.type === "text" && event.target.value !== event.target.defaultValue;
   const key = event.key.toLowerCase();
   const name = key === "z" ? (event.shiftKey ? "redo" : "undo") : key === "y" ? "redo" : null;
-  if (!name || isTyping) return;
+  if (!name || isTyping || document.querySelector("dialog")) return;
   event.preventDefault();
   stepBack(name);
 }

@@ -2,12 +2,15 @@
 import { h, s, show } from "./dom.js";
 import { latestWins } from "./api.js";
 import { button, numberField, radioField } from "./fields.js";
-import { capitalised, percent, readable } from "./numbers.js";
+import { capitalised, fieldText, percent, readable } from "./numbers.js";
 import { choosePole, siteOf } from "./desk_map.js";
 import { change, data, isBusy, runJob, update } from "./store.js";
+import { drawTrial } from "./trial.js";
 import { drawWhatIf } from "./what_if.js";
 
 const MOST_SENSORS = 12;
+/** Steps of the budget's slider, about. */
+const STEPS = 40;
 /** What is being chosen. */
 const request = { by: "count", count: 2, budget: /** @type {number|null} */ (null) };
 /** Plan whose request was taken over. @type {any} */
@@ -29,6 +32,7 @@ export function drawPlan(panel) {
       : h("p.todo", {}, "Run first: the plan needs the scores of the poles."),
     hasResults && chooser(),
     plan && drawResult(plan),
+    plan && drawTrial(plan),
     data.keptPlan && plan && comparison(data.keptPlan, plan),
     project.obstacles && drawWhatIf());
 }
@@ -63,32 +67,65 @@ function body() {
 /** @param {number} most */
 function countSlider(most) {
   const output = h("output", { for: "count" }, request.count);
-  const slider = h("input", {
-    id: "count", type: "range", min: 1, max: most, step: 1, value: request.count, "data-key": "count",
-    oninput() {
-      request.count = Number(slider.value);
-      output.textContent = slider.value;
-      const find = document.querySelector('[data-key="find"]');
-      if (find) find.textContent = countText();
-    },
-    onchange() {
-      if (data.plan) choose(body());
-    },
+  const slider = h("input", { id: "count", type: "range", min: 1, max: most, step: 1, value: request.count, "data-key": "count" });
+  whenSlid(slider, () => {
+    request.count = Number(slider.value);
+    output.textContent = slider.value;
+    const find = document.querySelector('[data-key="find"]');
+    if (find) find.textContent = countText();
   });
   return h("div.slider", {}, h("label", { for: "count" }, "Sensors"), slider, output);
 }
 
+/** Call a function while a slider moves; find the plan again in the end, if there is one. @param {HTMLInputElement} slider @param {() => void} onInput */
+function whenSlid(slider, onInput) {
+  slider.addEventListener("input", onInput);
+  slider.addEventListener("change", () => data.plan && choose(body()));
+}
+
 function budgetFields() {
-  const money = (/** @type {string} */ key, /** @type {string} */ label, /** @type {string} */ setting) => numberField({
-    key, label, value: data.project.costs[setting], limits: { min: 0 }, placeholder: "not given", send: (value, refuse) => change("PUT", "settings", { [setting]: value }, refuse),
+  const { costs } = data.project;
+  const used = Object.keys(costs.sensor_costs);
+  const money = (/** @type {string} */ key, /** @type {string} */ label, /** @type {number|null} */ value, /** @type {(value: number|null) => object} */ setting) => numberField({
+    key, label, value, limits: { min: 0 }, placeholder: "not given", send: (typed, refuse) => change("PUT", "settings", setting(typed), refuse),
   });
   return [
-    h("div.pair", {}, money("pole_cost", "A new pole costs", "pole_cost"), money("sensor_cost", "A sensor costs", "sensor_cost")),
-    numberField({ key: "budget", label: "Budget", value: request.budget, limits: { min: 0 }, send(value) {
-      request.budget = value;
-      update({ plan: data.plan });
-    } }),
+    h("div.pair", {}, money("pole_cost", "A new pole costs", costs.pole_cost, (pole_cost) => ({ pole_cost })),
+      used.map((name) => money(`cost.${name}`, `A ${used.length > 1 ? name : "sensor"} costs`, costs.sensor_costs[name], (cost) => ({ sensor_costs: { [name]: cost } })))),
+    budgetSlider(costs),
   ];
+}
+
+/** Budgets from the cheapest plan to the dearest one, with round numbers between them. @param {number} least @param {number} most */
+function budgets(least, most) {
+  const power = 10 ** Math.floor(Math.log10((most - least) / STEPS || 1));
+  const step = power * ([1, 2, 5].find((factor) => (most - least) / STEPS <= factor * power) ?? 10);
+  const round = [];
+  for (let number = Math.floor(least / step) + 1; number * step < most; number += 1) round.push(number * step);
+  return [...new Set([least, ...round, most])];
+}
+
+/** @param {{least: number|null, most: number|null}} costs of the cheapest and the dearest plan; null where they are not known */
+function budgetSlider({ least, most }) {
+  const stops = least === null || most === null ? [] : budgets(least, most);
+  request.budget ??= data.plan?.cost || least;
+  const field = numberField({ key: "budget", label: "Budget", value: request.budget, limits: { min: 0 }, send(value) {
+    request.budget = value;
+    update({ plan: data.plan });
+  } });
+  if (stops.length < 2) return field;
+  const at = stops.findIndex((stop) => stop >= (request.budget ?? 0));
+  const slider = h("input", {
+    type: "range", min: 0, max: stops.length - 1, step: 1, value: at < 0 ? stops.length - 1 : at, "data-key": "budget_slider",
+    "aria-label": "Budget from the cheapest to the dearest plan", "aria-valuetext": readable(request.budget),
+  });
+  whenSlid(slider, () => {
+    request.budget = stops[Number(slider.value)];
+    slider.setAttribute("aria-valuetext", readable(request.budget));
+    const input = field.querySelector("input");
+    if (input) input.value = fieldText(request.budget);
+  });
+  return h("div.slider.budget", {}, slider, field);
 }
 
 // ---------------------------------------------------------------- result
@@ -101,7 +138,9 @@ function drawResult(plan) {
     h("p.quiet", {}, `${capitalised(plan.certificate_text)}.`, hasCost && ` Costs ${readable(plan.cost)}.`),
     h("ol.sensors", {}, plan.sensors.map((/** @type {any} */ sensor) => sensorItem(sensor, ` ${plan.change_unit}`))),
     curve(plan),
-    h("div.tools", {}, button(data.keptPlan ? "Compare with this one instead" : "Keep, to compare with another", () => update({ keptPlan: plan }), { key: "keep" })));
+    h("div.tools", {},
+      !plan.outdated && !plan.sensors.some((/** @type {any} */ sensor) => sensor.adds_text.length) && button("What does each sensor add?", () => runJob("additions"), { key: "adds", isDisabled: isBusy() }),
+      button(data.keptPlan ? "Compare with this one instead" : "Keep, to compare with another", () => update({ keptPlan: plan }), { key: "keep" })));
 }
 
 /** @param {any} sensor @param {string} points unit of gains */
@@ -111,7 +150,7 @@ function sensorItem(sensor, points) {
     h("button.link", { type: "button", "data-key": `sensor.${sensor.site}`, "aria-pressed": String(name === data.selected), onclick: () => choosePole(name) }, sensor.pole ?? sensor.site),
     ` ${sensor.sensor}, ${readable(sensor.z_m, 1)} m up, tilt ${readable(sensor.pitch_deg)}°`,
     h("small", {}, `Adds ${sensor.gain_text}${points}`, sensor.loss_text && `; if it fails, ${sensor.loss_text}${points} are lost`, sensor.cost ? `; costs ${readable(sensor.cost)}` : "", sensor.forced && "; it must be chosen"),
-    (sensor.adds_text ?? []).map((/** @type {string} */ text) => h("small", {}, text))));
+    sensor.adds_text.map((/** @type {string} */ text) => h("small", {}, text))));
 }
 
 /** What 1, 2, ... sensors reach. @param {any} plan */

@@ -83,7 +83,6 @@ function drawRanking(ranking) {
   if (data.selected !== listed) turnTo("ranking", at);
   listed = data.selected;
   return h("section", {}, h("h2", {}, ranking.outdated ? "Ranking before the changes" : "Ranking"),
-    (ranking.text ?? []).map((/** @type {string} */ sentence) => h("p", {}, sentence)),
     pagedTable({
       key: "ranking", caption: "Poles, best first", rows: ranking.poles, redraw: () => update({ ranking }), isSelected: (pole) => siteOf(pole.pole) === data.selected,
       columns: [

@@ -1,6 +1,6 @@
 // What the page knows, and the only place that changes it.
 import { ApiError, get, getIfAny, post, request } from "./api.js";
-import { byId, h, show } from "./dom.js";
+import { ask, byId, h, show } from "./dom.js";
 
 /**
  * @typedef {Object} Data
@@ -15,6 +15,7 @@ import { byId, h, show } from "./dom.js";
  * @property {any} downloads
  * @property {any[]|null} suggestions kerb positions that are shown
  * @property {any} keptPlan a plan to compare with
+ * @property {any} trial what another sensor on one pole of the plan would change
  * @property {any} whatIf
  * @property {string} step
  * @property {string|null} selected name of the chosen site or junction
@@ -25,7 +26,7 @@ import { byId, h, show } from "./dom.js";
 /** @type {Data} */
 export const data = {
   revision: -1, project: null, job: null, start: null, map: null, upload: null, ranking: null, plan: null,
-  downloads: null, suggestions: null, keptPlan: null, whatIf: null, step: "poles", selected: null, isAdding: false,
+  downloads: null, suggestions: null, keptPlan: null, trial: null, whatIf: null, step: "poles", selected: null, isAdding: false,
   log: [],
 };
 
@@ -120,7 +121,7 @@ function refreshResults() {
     const hasRun = project.run.state !== "none";
     const ranking = hasRun ? await getIfAny("ranking") : null;
     const plan = hasRun && project.run.has_plan ? await getIfAny("plan") : null;
-    if (data.project?.id === project.id) update({ ranking, plan, downloads: null });
+    if (data.project?.id === project.id) update({ ranking, plan, downloads: null, trial: null });
   }, ignoreIfClosed);
 }
 
@@ -134,6 +135,29 @@ let changes = Promise.resolve();
 export const settled = () => changes;
 
 /**
+ * Send a change. The server refuses the first one after which the results of a run are out of date, until that is agreed to.
+ * @param {"POST"|"PUT"|"PATCH"|"DELETE"} method
+ * @param {string} path
+ * @param {any} body
+ * @param {(error: ApiError) => void} [onRefusal]
+ * @param {boolean} [keep_results]
+ * @returns {Promise<any>}
+ */
+async function send(method, path, body, onRefusal, keep_results = true) {
+  let question = "";
+  const answer = await attempt(() => request(method, path, body instanceof Blob ? body : { ...body, keep_results }), (error) => {
+    if (error.field === "keep_results") question = error.message;
+    else if (onRefusal) onRefusal(error);
+    else say(error.message, "error");
+  });
+  if (!question) return answer;
+  const text = `${question} ${path === "undo" ? "Redo" : "Undo"} brings them back.`;
+  if (await ask("The results will be out of date", text, "Change", "Keep the results")) return send(method, path, body, onRefusal, false);
+  update({ project: data.project }); // shows what is still so
+  return null;
+}
+
+/**
  * Change the project; every change answers with the new state.
  * @param {"POST"|"PUT"|"PATCH"|"DELETE"} method
  * @param {string} path
@@ -143,7 +167,7 @@ export const settled = () => changes;
  */
 export function change(method, path, body = {}, onRefusal) {
   const state = changes.then(async () => {
-    const answer = await attempt(() => request(method, path, body), onRefusal);
+    const answer = await send(method, path, body, onRefusal);
     if (!answer) return null;
     say("");
     takeState(answer);
@@ -162,7 +186,7 @@ const waiting = new Map();
 export function takeJob(job) {
   update({ job });
   if (job.state === "runs") return;
-  if (job.state === "done" && (job.kind === "run" || job.kind === "plan") && data.project) {
+  if (job.state === "done" && ["run", "plan", "additions"].includes(job.kind) && data.project) {
     resultsKey = "";
     refreshResults();
   }

@@ -1,0 +1,182 @@
+"""What the desk takes: start, the first click, a dragged pole with and without scores, and the memory of the server.
+
+``python -m benchmarks.desk [--poles 300] [--moves 60]`` serves a folder with the shipped junction, all poles around its
+candidates, and a finished run, and drags a pole in Chromium (needs ``egvs[desk]``, playwright and Chromium). A move is
+shown when the browser has painted the frame after it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import http.client
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+from playwright.sync_api import sync_playwright
+
+import egvs
+
+SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
+LIMITS = {
+    "first answer, s": "1.5", "first click, s": "2.5", "move shown without scores, ms": "60 (95 %: 120)",
+    "move shown with scores, ms": "60 (95 %: 120)", "new score of a move, ms": "120 (95 %: 200)",
+    "score of the last position, ms": "250", "memory beyond the scenario's, MB": "120",
+}  # fmt: skip
+WATCH = """() => {
+  window.shown = { moves: [], scores: [], last: 0 };
+  const bubble = document.querySelector(".bubble");
+  addEventListener("pointermove", (event) => {
+    shown.last = performance.now();
+    requestAnimationFrame(() => { const painted = new MessageChannel();
+      painted.port1.onmessage = () => shown.moves.push(performance.now() - event.timeStamp);
+      painted.port2.postMessage(0); });
+  }, true);
+  new MutationObserver(() => {
+    if (/rank \\d/.test(bubble.textContent)) shown.scores.push(performance.now() - shown.last);
+  }).observe(bubble, { subtree: true, childList: true, characterData: true });
+}"""
+
+
+def write_poles(folder: Path, number: int) -> None:
+    """Write a sites file with as many poles, spread around those of the scenario."""
+    with (SCENARIO / "sites.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    rng = np.random.default_rng(1)
+    with (folder / "sites.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+        writer.writeheader()
+        for count, row in zip(range(number), cycle(rows), strict=False):
+            x_m, y_m = (round(float(row[key]) + rng.uniform(-1.0, 1.0), 2) for key in ("x_m", "y_m"))
+            writer.writerow({**row, "site": f"p{count:03}", "x_m": x_m, "y_m": y_m, "z_m": 4})
+
+
+@contextmanager
+def server(folder: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Serve a folder by the command line; yields the process and the address."""
+    command = [sys.executable, "-m", "egvs", "desk", str(folder), "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield process, process.stdout.readline().split()[0]
+        finally:
+            process.terminate()
+
+
+def first_answer_s(folder: Path) -> float:
+    """Return the seconds from the start of the command to the first answer."""
+    begin = time.perf_counter()
+    with server(folder) as (_, address):
+        split = urlsplit(address)
+        connection = http.client.HTTPConnection(split.netloc)
+        connection.request("GET", f"{split.path}?{split.query}")
+        assert connection.getresponse().status == 303
+        return time.perf_counter() - begin
+
+
+def memory_mb(pid: int) -> float:
+    """Return the memory of a process and its children; pages that several share count once."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="utf-8").split()
+    rows = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="utf-8").splitlines()
+    pss = next(int(row.split()[1]) for row in rows if row.startswith("Pss:"))
+    return pss / 1000 + sum(memory_mb(int(child)) for child in children)
+
+
+def scenario_mb(run: Path) -> float:
+    """Return the memory of a process that scores sites of the run."""
+    code = (
+        "import os, sys, egvs; from benchmarks.desk import memory_mb\n"
+        "session = egvs.open_session(sys.argv[1])\n"
+        "session.rate('p000', egvs.Pose(x_m=190, y_m=256, z_m=4, yaw_deg=0))\n"
+        "print(memory_mb(os.getpid()))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(run)], capture_output=True, text=True, check=True)
+    return float(done.stdout)
+
+
+def open_scenario(tab: Any, name: str) -> None:
+    """Open a scenario on the start page, and take hold of its first pole."""
+    tab.get_by_title(f"Open {name}").click()
+    pole = tab.locator('.item[data-id="p000"] .body')
+    pole.wait_for()
+    tab.wait_for_timeout(2000)
+    tab.evaluate(WATCH)
+    box = pole.bounding_box()
+    tab.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    tab.mouse.down()
+
+
+def drag(tab: Any, moves: int, pause_ms: float) -> dict[str, list[float]]:
+    """Move the pole along a circle of 6 pixels; returns milliseconds of moves and scores."""
+    tab.evaluate("Object.assign(shown, { moves: [], scores: [] })")
+    box = tab.locator('.item[data-id="p000"] .body').bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    for angle in np.linspace(0.0, 2.0 * np.pi, moves):
+        tab.mouse.move(x + 6.0 * np.sin(angle), y + 6.0 - 6.0 * np.cos(angle))
+        tab.wait_for_timeout(pause_ms)
+    tab.wait_for_timeout(1000)
+    found: dict[str, list[float]] = tab.evaluate("shown")
+    return found
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[tuple[subprocess.Popen[str], Any, float]]:
+    """Serve a folder and open it in a browser; yields the server, the tab, and the seconds until it can be clicked."""
+    begin = time.perf_counter()
+    with server(folder) as (process, address), sync_playwright() as playwright:
+        path = shutil.which("chromium") or shutil.which("chromium-browser")
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        tab = browser.new_page(viewport={"width": 1280, "height": 800})
+        tab.goto(address)
+        tab.get_by_title("Open plain").wait_for()
+        yield process, tab, time.perf_counter() - begin
+        browser.close()
+
+
+def measure(folder: Path, moves: int) -> Iterator[tuple[str, list[float]]]:
+    """Yield each figure with its values."""
+    yield "first answer, s", [first_answer_s(folder) for _ in range(5)]
+    with opened(folder) as (_, tab, clickable_s):
+        yield "first click, s", [clickable_s]
+        open_scenario(tab, "plain")
+        yield "move shown without scores, ms", drag(tab, moves, 30.0)["moves"]
+    with opened(folder) as (process, tab, _):
+        open_scenario(tab, "shinjuku")
+        drag(tab, 2, 0.0)  # reads the run
+        tab.locator(".bubble", has_text=", rank ").wait_for(timeout=120_000)
+        found = drag(tab, moves, 400.0)
+        yield "move shown with scores, ms", found["moves"]
+        yield "new score of a move, ms", found["scores"]
+        yield "score of the last position, ms", [drag(tab, moves, 0.0)["scores"][-1] for _ in range(3)]
+        yield "memory beyond the scenario's, MB", [memory_mb(process.pid) - scenario_mb(folder / "runs" / "shinjuku")]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the median and the 95th percentile of each figure, with its limit."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.desk", description=__doc__.split("\n")[0])
+    parser.add_argument("--poles", type=int, default=300)
+    parser.add_argument("--moves", type=int, default=60)
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        shutil.copytree(SCENARIO, folder / "shinjuku")
+        write_poles(folder / "shinjuku", options.poles)
+        shutil.copytree(folder / "shinjuku", folder / "plain")
+        egvs.run(egvs.load(folder / "shinjuku", ["traffic.frames=500"]), folder / "runs" / "shinjuku")
+        for name, values in measure(folder, options.moves):
+            median, high = np.percentile(values, [50, 95])
+            print(f"{name}: {median:.3g} (95 %: {high:.3g}; {len(values)}); limit {LIMITS.get(name, '-')}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
