@@ -154,14 +154,12 @@ def group_score(score: str, group: str) -> str:
 
 def log_points(points: FloatArray) -> FloatArray:
     r"""Return :math:`g(n) = \ln(1 + n)`."""
-    gain: FloatArray = np.log1p(points)
-    return gain
+    return np.log1p(points)
 
 
 def saturating_gain(points: FloatArray) -> FloatArray:
     r"""Return :math:`g(n) = 1 - e^{-n / n_0}`, from 0 to 1, with :data:`SEEN_WELL_POINTS`."""
-    gain: FloatArray = -np.expm1(-points / SEEN_WELL_POINTS)
-    return gain
+    return -np.expm1(-points / SEEN_WELL_POINTS)
 
 
 def points_on_target(visible: TargetVisibility, gain: Gain = log_points, weight: FloatArray | None = None) -> float:
@@ -372,8 +370,7 @@ def expected_by_points(points: FloatArray) -> FloatArray:
     >>> expected_by_points(np.array([0.0, 19.0, 20.0, 300.0])).tolist()
     [0.0, 0.0, 1.0, 1.0]
     """
-    is_found: FloatArray = (points >= PEOPLE_POINTS).astype(np.float64)
-    return is_found
+    return (points >= PEOPLE_POINTS).astype(np.float64)
 
 
 def expected_by_detector(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:

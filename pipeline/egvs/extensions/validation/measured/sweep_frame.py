@@ -129,8 +129,7 @@ def stand_upright(site: SensorSite, pairs: SweepPairs) -> tuple[SensorSite, Swee
 def in_sensor_frame(site: SensorSite, points_m: FloatArray) -> FloatArray:
     """Return points (n, 3) of the frame of the sweeps in that of the sensor."""
     to_world = rotation_world_sensor(*site.frame_pose.angles_deg)
-    points: FloatArray = points_m @ to_world.T @ rotation_world_sensor(*site.pose.angles_deg)
-    return points
+    return points_m @ to_world.T @ rotation_world_sensor(*site.pose.angles_deg)
 
 
 def describe_other_rings(site: SensorSite, sweeps: Sequence[Sweep]) -> str | None:
