@@ -27,8 +27,8 @@ from benchmarks.measured_vehicles import (
     find_candidates,
     ground_heights,
 )
-from egvs.clouds.sweeps import BoolArray, Detections, SiteView, Sweep
-from egvs.core.grid import FloatArray, Roi
+from egvs.clouds.sweeps import Detections, SiteView, Sweep
+from egvs.core.grid import BoolArray, FloatArray, Roi
 from egvs.extensions.hardware.fit import empty_scan, output
 from egvs.extensions.hardware.fit.empty_scan import EmptyScanFit
 from egvs.extensions.hardware.fit.fit import SensorFit

@@ -26,9 +26,8 @@ from sklearn.ensemble import HistGradientBoostingClassifier, HistGradientBoostin
 import egvs
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.simulation import CloudSimulator
-from egvs.clouds.sweeps import BoolArray
 from egvs.core import files
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.extensions.validation.detection_metrics import paired_overlap
 from egvs.extensions.validation.detector_results import frame_classes
 from egvs.extensions.validation.detectors import range_image, segment_model

@@ -162,7 +162,7 @@ def parquet(data: bytes, columns: Sequence[str] | None = None) -> object:
     import pyarrow
     import pyarrow.parquet as pq
 
-    table = pq.read_table(pyarrow.BufferReader(data), columns=columns)
+    table = pq.read_table(pyarrow.BufferReader(data), columns=columns and list(columns))
     return repr(table.to_pydict())
 
 

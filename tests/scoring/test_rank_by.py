@@ -386,10 +386,14 @@ def test_wrong_scores_of_plugins_are_named(mini: Path, tmp_path: Path, plugin: N
         InputError, match=r"score\.rank_by.*'density'"
     ):  # it gives a number for a site, none for vehicles
         loading.load(mini, ["score.rank_by=density"])
-    for name, text in (
-        ("of_sites", "only a egvs.scoring.target_scores.VehicleScore can rank sites, got a str"),
-        ("wrong", "score wrong: expected 76 numbers from 0 to 1, got values from"),
+    for name, expected, text in (
+        (
+            "of_sites",
+            2,
+            "score.rank_by: 'of_sites' is a str, which cannot rank sites. Use an egvs.scoring.target_scores",
+        ),
+        ("wrong", 1, "score wrong: expected 76 numbers from 0 to 1, got values from"),
     ):
         code, _, error = run_egvs("run", mini, "--out", tmp_path / name, "--set", f"score.rank_by={name}")
-        assert (code, text in error) == (1, True), error
+        assert (code, text in error) == (expected, True), error
         assert not (tmp_path / name / "scores.parquet").exists()

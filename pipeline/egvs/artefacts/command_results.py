@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts.checksums import add_checksum, has_valid_checksum
-from egvs.artefacts.run_record import StageRecord, have_inputs
 from egvs.core import files, reading
 from egvs.core.errors import InputError
 
@@ -33,10 +32,6 @@ class CommandResult:
 
     stages: Mapping[str, str]
     values: Mapping[str, Any]
-
-    def is_current(self, stages: Mapping[str, StageRecord]) -> bool:
-        """Whether the result was computed from the same inputs as a run with these stages."""
-        return have_inputs(stages, self.stages)
 
 
 def read_results(path: Path) -> dict[str, CommandResult]:

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
 from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS, check_frame_order
-from egvs.core.grid import Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 
 
 def read_trajectories(path: str | Path) -> pa.Table:
@@ -50,24 +49,24 @@ class TrafficFrame:
     number: int
     vehicles: tuple[str, ...]
     kinds: tuple[str, ...]
-    boxes: NDArray[np.float64]
-    pitch_rad: NDArray[np.float64]
-    part: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    boxes: FloatArray
+    pitch_rad: FloatArray
+    part: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
         if not len(self.part):
             object.__setattr__(self, "part", np.zeros(len(self.boxes), dtype=np.int64))
 
-    def several_parts(self) -> NDArray[np.bool_]:
+    def several_parts(self) -> BoolArray:
         """Return which boxes belong to vehicles with more than one part, (n,) bool."""
         vehicles = np.array(self.vehicles, dtype=np.str_)
         return np.isin(vehicles, vehicles[self.part > 0])
 
-    def are_vehicles(self) -> NDArray[np.bool_]:
+    def are_vehicles(self) -> BoolArray:
         """Return which boxes are vehicles or parts of them, (n,) bool."""
         return np.isin(self.kinds, list(NON_VEHICLE_KINDS), invert=True)
 
-    def target_rows(self, roi: Roi, people: Collection[str] = ()) -> NDArray[np.int64]:
+    def target_rows(self, roi: Roi, people: Collection[str] = ()) -> IntArray:
         """Return the rows of the targets: vehicles whose centre is in the region of interest (half-open, as voxels).
 
         ``people`` names those of :data:`NON_VEHICLE_KINDS` that are targets too.
@@ -77,7 +76,7 @@ class TrafficFrame:
         return np.flatnonzero(inside & (self.are_vehicles() | np.isin(self.kinds, list(people))))
 
 
-def spaced_frames(recorded: int, count: int) -> NDArray[np.int64]:
+def spaced_frames(recorded: int, count: int) -> IntArray:
     """Return ``count`` evenly spaced frames of 0 to ``recorded`` - 1, the middles of equal parts, ascending int64.
 
     All frames where ``count`` is 0, or not below their number.
@@ -87,7 +86,7 @@ def spaced_frames(recorded: int, count: int) -> NDArray[np.int64]:
     return (2 * np.arange(count, dtype=np.int64) + 1) * recorded // (2 * count)
 
 
-def read_frames(path: Path, numbers: NDArray[np.int64]) -> Iterator[TrafficFrame]:
+def read_frames(path: Path, numbers: IntArray) -> Iterator[TrafficFrame]:
     """Yield some frames of ``trajectories.parquet``, in order; also those without any box.
 
     Parameters

@@ -35,6 +35,7 @@ from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
     from egvs.creation.new_scenario import NewScenarioOptions
+    from egvs.explore.page_file import PageFile
     from egvs.scenario.model import Scenario
     from egvs.studies.effect_study import EffectStatus
 
@@ -446,19 +447,27 @@ def explore(
         return
     plugins.require_libraries("egvs explore", "explore", "viser", "PIL")
     from egvs.cli import answer, sources
+    from egvs.explore import page_file
     from egvs.explore.page import Page, check_port_free
     from egvs.explore.settings import open_session
 
-    if to is not None:
-        _write_page_file(folder, set_, out, jobs, to, has_page_options=bool(port or view))
-        return
-    check_port_free(port)
+    if to is None:
+        check_port_free(port)
+    else:
+        if port or view:
+            raise InputError("--to", "cannot be combined with --port or --view", "Leave them out: no page is served.")
+        page_file.check_page_file(to)
     scenario, _ = sources.open_source(folder, set_, out)
     with ProgressDisplay("explore") as screen:
         screen.flow_source = answer.flow_source(scenario)
         session = open_session(
             folder, set_ or (), out, jobs=jobs, progress=screen.progress, listener=screen.stage_event
         )  # fmt: skip
+        if to is not None:
+            written = page_file.write_page_file(session, to, screen.progress)
+    if to is not None:
+        _print_page_file(written)
+        return
     command = cli_options.command_words("explore", folder, set_, out)
     with files.temporary_folder() as scratch:
         page = Page(session, scratch, port, tuple(command))
@@ -484,25 +493,8 @@ def _open_start_page(context: typer.Context, port: int, *, browser: bool) -> Non
     command.callback(folder=Path(), port=port, browser=browser)
 
 
-def _write_page_file(
-    folder: Path, set_: list[str] | None, out: Path | None, jobs: int | None, to: Path, *, has_page_options: bool
-) -> None:
-    """Write the 3D view of a run as one HTML file, and print what is in it."""
-    from egvs.cli import answer, sources
-    from egvs.cli.console import ProgressDisplay
-    from egvs.explore.page_file import check_page_file, write_page_file
-    from egvs.explore.settings import open_session
-
-    if has_page_options:
-        raise InputError("--to", "cannot be combined with --port or --view", "Leave them out: no page is served.")
-    check_page_file(to)
-    scenario, _ = sources.open_source(folder, set_, out)
-    with ProgressDisplay("explore") as screen:
-        screen.flow_source = answer.flow_source(scenario)
-        session = open_session(
-            folder, set_ or (), out, jobs=jobs, progress=screen.progress, listener=screen.stage_event
-        )  # fmt: skip
-        page = write_page_file(session, to, screen.progress)
+def _print_page_file(page: PageFile) -> None:
+    """Print where the 3D view of a run was written, and what is in it."""
     drawn = f"{page.returns:,} returns on road users"
     if page.returns_drawn < page.returns:
         drawn += f", {page.returns_drawn:,} of them drawn"
@@ -826,12 +818,8 @@ def new(
         raise InputError("--from", "no map is given", hint)
     if overpass_url is not None and not download:
         raise InputError("--overpass", "has no effect without --download", "Add --download.")
-    location = None
-    if at is not None:
-        location = cli_options.latitude_and_longitude(at)
-    surroundings_m = None
-    if surroundings is not None:
-        surroundings_m = cli_options.radius_m(surroundings)
+    location = None if at is None else cli_options.latitude_and_longitude(at)
+    surroundings_m = None if surroundings is None else cli_options.radius_m(surroundings)
     if traffic is not None and vehicles_per_hour is not None:
         raise InputError("--traffic", "cannot be combined with --vehicles-per-hour", "Use one of them.")
     if counts is not None and (traffic is not None or vehicles_per_hour is not None):
@@ -844,9 +832,7 @@ def new(
     demand: str | int = traffic or DEFAULT_TRAFFIC
     if vehicles_per_hour is not None:
         demand = vehicles_per_hour
-    pole_spacing_m = None
-    if poles is not None:
-        pole_spacing_m = cli_options.pole_spacing_m(poles)
+    pole_spacing_m = None if poles is None else cli_options.pole_spacing_m(poles)
     options = NewScenarioOptions(
         lefthand=lefthand, righthand=righthand, walk=walk, surroundings_m=surroundings_m, traffic=demand,
         pole_spacing_m=pole_spacing_m, existing_poles=poles == "existing",

@@ -136,7 +136,6 @@ def _compare_heights(paths: Sequence[Path], overrides: Sequence[str]) -> None:
     """Run a scenario with several heights of buildings, print one line for each, and which sites change."""
     from egvs.cli import study_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.runs import run
     from egvs.studies import assumed_heights
 
     path = _single_path(paths, _HEIGHTS_OPTION)
@@ -145,9 +144,8 @@ def _compare_heights(paths: Sequence[Path], overrides: Sequence[str]) -> None:
         total = len(prepared.runs)
 
         def run_one(number: int, height_run: HeightRun) -> None:
-            screen.begin_part(f"heights {height_run.label} ({number} of {total})")
-            run.run(height_run.scenario, height_run.folder, progress=screen.progress, listener=screen.stage_event)
-            screen.say(f"{height_run.label:<{_LABEL_WIDTH}}  {screen.part_duration:>10}   {height_run.folder}")
+            title, label = f"heights {height_run.label} ({number} of {total})", f"{height_run.label:<{_LABEL_WIDTH}}"
+            screen.run_part(title, label, height_run.scenario, height_run.folder)
 
         if prepared.assumed:
             sensitivity = assumed_heights.compare_heights(prepared, run_one)
@@ -168,7 +166,6 @@ def _single_path(paths: Sequence[Path], option: str) -> Path:
 
 def _run_sensors(screen: ProgressDisplay, paths: Sequence[Path], sensors: str, overrides: Sequence[str]) -> list[Path]:
     """Run a scenario with each sensor, print one line for each, and return the run folders."""
-    from egvs.runs import run
     from egvs.studies import sensor_runs
 
     prepared = sensor_runs.prepare_runs(_single_path(paths, _OPTION), sensors, overrides)
@@ -178,9 +175,8 @@ def _run_sensors(screen: ProgressDisplay, paths: Sequence[Path], sensors: str, o
     width = max(len(sensor_run.sensor) for sensor_run in prepared.runs)
 
     def run_one(number: int, sensor_run: SensorRun) -> None:
-        screen.begin_part(f"{sensor_run.sensor} ({number} of {total})")
-        run.run(sensor_run.scenario, sensor_run.folder, progress=screen.progress, listener=screen.stage_event)
-        screen.say(f"{sensor_run.sensor:<{width}}  {screen.part_duration:>10}   {sensor_run.folder}")
+        title, label = f"{sensor_run.sensor} ({number} of {total})", f"{sensor_run.sensor:<{width}}"
+        screen.run_part(title, label, sensor_run.scenario, sensor_run.folder)
 
     def leave_out(sensor_run: SensorRun, reason: str) -> None:
         screen.say(f"{sensor_run.sensor:<{width}}  {'left out':>10}   {reason}")

@@ -12,7 +12,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, Generic, Literal, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
@@ -23,6 +24,9 @@ from egvs.artefacts.run_record import StageRecord
 from egvs.cli import stage_summary
 from egvs.core.errors import Diagnostic, collect_warnings, escape_control_characters
 from egvs.core.wording import format_percent, number_of
+
+if TYPE_CHECKING:
+    from egvs.scenario.model import Scenario
 
 NARROW, WIDE = 110, 190
 """Terminals below ``NARROW`` columns get fewer columns of tables; those of about ``WIDE`` get all."""
@@ -270,6 +274,14 @@ class ProgressDisplay:
         self._part = f"{title}: "
         self._part_seconds = 0.0
         self._part_states = set()
+
+    def run_part(self, title: str, label: str, scenario: Scenario, folder: Path) -> None:
+        """Run one of several scenarios of a command, and print how long it took, and its folder, after a label."""
+        from egvs.runs import run
+
+        self.begin_part(title)
+        run.run(scenario, folder, progress=self.progress, listener=self.stage_event)
+        self.say(f"{label}  {self.part_duration:>10}   {folder}")
 
     def end_parts(self, verb: str) -> None:
         """Show what follows the last of several runs under the name of the command."""

@@ -50,9 +50,9 @@ def print_runs(runs: Sequence[ListedRun], *, with_details: bool = False) -> None
         out.print("egvs runs --verbose lists the settings in which each run differs from its scenario")
 
 
-def runs_table(runs: Sequence[ListedRun], width: int, now_s: float) -> Table:
-    """Return the table for a terminal of a width in characters; ``now_s`` is the time in seconds since 1970."""
-    columns: list[Column[ListedRun]] = [
+def _columns(now_s: float) -> list[Column[ListedRun]]:
+    """Return what is listed of a run, its folder first; ``now_s`` is the time in seconds since 1970."""
+    return [
         Column("run", lambda run: run.folder.name, "left", wrap=True),
         Column("scenario", _format_scenario, "left", wrap=True, min_width=_WIDE),
         Column("differs in", _format_overrides, "left", wrap=True, min_width=_WIDE),
@@ -63,23 +63,19 @@ def runs_table(runs: Sequence[ListedRun], width: int, now_s: float) -> Table:
         Column("size", lambda run: format_size(run.size_bytes)),
         Column("last run", lambda run: _format_last_run(run, now_s)),
     ]
-    return make_table(columns, runs, width=width)
+
+
+def runs_table(runs: Sequence[ListedRun], width: int, now_s: float) -> Table:
+    """Return the table for a terminal of a width in characters; ``now_s`` is the time in seconds since 1970."""
+    return make_table(_columns(now_s), runs, width=width)
 
 
 def describe_run(run: ListedRun, now_s: float) -> str:
     """Return all that is listed of a run, in lines; ``now_s`` is the time in seconds since 1970."""
     lines = [str(run.folder)]
-    entries = {
-        "scenario": _format_scenario(run),
-        "differs in": _format_overrides(run),
-        "state": _format_state(run),
-        "best": _format_best(run),
-        "score": _format_score(run),
-        "sites": "" if run.best is None else str(run.best.of_sites),
-        "size": format_size(run.size_bytes),
-        "last run": _format_last_run(run, now_s),
-    }
-    lines += [f"  {name:<10}  {text}" for name, text in entries.items() if text]
+    for column in _columns(now_s)[1:]:
+        if text := column.text(run):
+            lines.append(f"  {column.title:<10}  {text}")
     return "\n".join(lines)
 
 

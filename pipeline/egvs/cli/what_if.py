@@ -32,7 +32,6 @@ def what_if(
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay("what-if") as screen:
-        from egvs.runs import run
         from egvs.studies import what_if as study
 
         prepared = study.prepare_runs(scenario, options.with_detector(set_, detector), only or [])
@@ -41,9 +40,8 @@ def what_if(
 
         def run_one(number: int, what_if_run: WhatIfRun) -> None:
             label = _run_label(what_if_run)
-            screen.begin_part(f"{label} ({number} of {total})")
-            run.run(what_if_run.scenario, what_if_run.folder, progress=screen.progress, listener=screen.stage_event)
-            screen.say(f"{label:<{width}}  {screen.part_duration:>10}   {what_if_run.folder}")
+            title = f"{label} ({number} of {total})"
+            screen.run_part(title, f"{label:<{width}}", what_if_run.scenario, what_if_run.folder)
 
         result = study.compare_runs(prepared, run_one)
         written = study.record_answers(result)

@@ -62,7 +62,7 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.sweeps import LabelledSweep, SiteView, Sweep
 from egvs.core import files, plugins
 from egvs.core.errors import InputError, MissingBackendError, check_list
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.effects.base import Echo, Echoes, checked_shares
 from egvs.effects.merge import Cones, Merge
 from egvs.effects.returns import ReturnProbability
@@ -148,7 +148,7 @@ class VehicleMeshes:
     """
 
     kinds: tuple[str, ...]
-    shapes: tuple[IntArray, FloatArray, NDArray[np.bool_], IntArray, FloatArray, FloatArray, FloatArray]
+    shapes: tuple[IntArray, FloatArray, BoolArray, IntArray, FloatArray, FloatArray, FloatArray]
     surfaces: NDArray[np.str_]
 
     @classmethod

@@ -16,9 +16,6 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Pose
 
-BoolArray = NDArray[np.bool_]
-"""Array of bool, of the shape that each docstring states."""
-
 
 @dataclass(frozen=True)
 class Sweep:

@@ -34,6 +34,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 """Array of int64, of the shape that each docstring states."""
 
+BoolArray = NDArray[np.bool_]
+"""Array of bool, of the shape that each docstring states."""
+
 XY = tuple[float, float]
 """x, y in metres."""
 

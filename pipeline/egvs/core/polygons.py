@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core import limits
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
@@ -102,11 +103,10 @@ def _repair_rings(polygon: BaseGeometry, where: object, count: PairCount) -> Bas
     second = np.concatenate([part_of_side[1:][is_pair], np.full(np.count_nonzero(is_outer), outside)])
     neighbours = coo_array((np.ones(len(first)), (first, second)), shape=(outside + 1, outside + 1)).tocsr()
     edges_to_outside = dijkstra(neighbours, directed=False, unweighted=True, indices=outside)[:outside]
-    area: BaseGeometry = shapely.coverage_union_all(parts[edges_to_outside % 2 == 1])
-    return area
+    return shapely.coverage_union_all(parts[edges_to_outside % 2 == 1])
 
 
-def _sides(parts: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _sides(parts: NDArray[Any]) -> tuple[IntArray, IntArray]:
     """Return, for each side of each edge, its part and its edge, sorted by edges."""
     import shapely
 
@@ -193,7 +193,7 @@ def check_crossings(shapes: Iterable[BaseGeometry], where: object, count: PairCo
     starts, ends = points[:-1][is_edge], points[1:][is_edge]
     boxes = shapely.box(*np.minimum(starts, ends).T, *np.maximum(starts, ends).T)
 
-    def cross(one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def cross(one: IntArray, other: IntArray) -> BoolArray:
         return _are_separated(starts[one], ends[one], starts[other], ends[other]) & _are_separated(
             starts[other], ends[other], starts[one], ends[one]
         )
@@ -203,21 +203,18 @@ def check_crossings(shapes: Iterable[BaseGeometry], where: object, count: PairCo
     _count_pairs(boxes, where, count, what, is_counted=cross)
 
 
-def _are_separated(
-    start: NDArray[np.float64], end: NDArray[np.float64], one: NDArray[np.float64], other: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _are_separated(start: FloatArray, end: FloatArray, one: FloatArray, other: FloatArray) -> BoolArray:
     """Return for each line (n, 2) from start to end whether two points (n, 2) are on different sides of it."""
     direction = end - start
     side_of_one = direction[:, 0] * (one - start)[:, 1] - direction[:, 1] * (one - start)[:, 0]
     side_of_other = direction[:, 0] * (other - start)[:, 1] - direction[:, 1] * (other - start)[:, 0]
-    are_separated: NDArray[np.bool_] = np.sign(side_of_one) * np.sign(side_of_other) < 0
-    return are_separated
+    return np.sign(side_of_one) * np.sign(side_of_other) < 0
 
 
 def _count_pairs(
     boxes: NDArray[Any], where: object, count: PairCount | None, what: str, *,
     free: int = _FREE_PAIRS, most: float = 1.0,
-    is_counted: Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.bool_]] | None = None,
+    is_counted: Callable[[IntArray, IntArray], BoolArray] | None = None,
 ) -> None:  # fmt: skip
     """Add the pairs of boxes that overlap, apart from those that follow each other, to those of a file.
 

@@ -34,8 +34,8 @@ _MEMORY_HINT = "Use a smaller file, or a machine with more memory."
 def translate_errors(where: object, expected: str = COMPLETE_FILE, doing: str = "cannot be read") -> Iterator[None]:
     """Translate any exception of the block to an InputError.
 
-    Errors of this program are not changed, nor is that of a full disk, nor a NameError, which no file causes. Where the
-    system cannot open a file, or has too little memory, the hint is about that.
+    Errors of this program are not changed, nor is that of a full disk. Where the system cannot open a file, or has too
+    little memory, the hint is about that.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def translate_errors(where: object, expected: str = COMPLETE_FILE, doing: str = 
     """
     try:
         yield
-    except (EgvsError, NameError):
+    except EgvsError:
         raise
     except OSError as error:
         if error.errno in DISK_FULL_ERRNOS:

@@ -457,7 +457,9 @@ def create_scenario(
         options.check_without_demand()
     with unpack_archives([*paths, *options.surface]) as unpacked:
         map_paths, surface = unpacked.paths[: len(paths)], unpacked.paths[len(paths) :]
-        draft = _open_files(Path(folder), map_paths, surface, at, options)
+        name = scenario_files.check_new_folder(Path(folder))
+        files, surface_files = map_readers.open_maps(map_paths), map_readers.open_surface(surface)
+        draft = _Draft(Path(folder), name, at, options, files, surface_files)
         draft.demand = demand
         _read_roads_and_recordings(draft)
         _choose_surroundings(draft)
@@ -554,18 +556,6 @@ def read_map_roads(
         return _read_roads(files.roads, road_options)
 
 
-def _open_files(
-    folder: Path,
-    maps: Sequence[Path],
-    surface: Sequence[Path],
-    at: tuple[float, float] | None,
-    options: NewScenarioOptions,
-) -> _Draft:
-    """Check the folder, and open the maps and the heights of roofs and trees."""
-    name = scenario_files.check_new_folder(folder)
-    return _Draft(folder, name, at, options, map_readers.open_maps(maps), map_readers.open_surface(surface))
-
-
 def _read_roads_and_recordings(draft: _Draft) -> None:
     """Read all roads of the map, and find the reader of each recording."""
     options, has_terrain = draft.options, bool(draft.files.terrain)
@@ -620,7 +610,9 @@ def _lay_on_ground(draft: _Draft) -> None:
     draft.roads = ground_reference.lay_on_ground(draft.roads, files.roads, draft.junction, terrain, files.terrain)
     draft.terrain_m = None
     if terrain is not None:
-        draft.terrain_m = _terrain_points(terrain, draft.window, draft.zero.height_m or 0.0)
+        points_m = ground_heights.ground_points(terrain, draft.window, TERRAIN_STEP_M)
+        points_m[:, 2] -= draft.zero.height_m or 0.0
+        draft.terrain_m = points_m
     draft.ground = ground_surface(draft.roads.streets, draft.terrain_m)
     draft.notes += [*draft.roads.notes, *draft.zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
 
@@ -871,13 +863,6 @@ def _site_columns(
     if unseen is not None and not np.isnan(unseen).all():
         columns["unseen_share"] = np.round(unseen, 3)
     return columns
-
-
-def _terrain_points(terrain: Terrain, window: BaseGeometry, zero_height_m: float) -> FloatArray:
-    """Return points (n, 3) of the ground in a window, world frame."""
-    points_m = ground_heights.ground_points(terrain, window, TERRAIN_STEP_M)
-    points_m[:, 2] -= zero_height_m
-    return points_m
 
 
 def _read_roads(file: MapFile, options: RoadOptions) -> RoadSource:

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from egvs.core.grid import FloatArray
 from egvs.drawing.svg_figures import Box
 from egvs.traffic import network, sumo_folder
 from egvs.traffic.network import Edge, Lane, Network
@@ -52,7 +52,7 @@ class Outlines:
 
     css_class: str
     kinds: tuple[str, ...]
-    rings: tuple[NDArray[np.float64], ...]
+    rings: tuple[FloatArray, ...]
 
 
 def world_outlines(world: World, box: Box) -> tuple[Outlines, ...]:
@@ -83,7 +83,7 @@ def world_outlines(world: World, box: Box) -> tuple[Outlines, ...]:
     return tuple(outlines)
 
 
-def union_of_triangles(triangles: NDArray[np.float64], box: Box) -> Any:
+def union_of_triangles(triangles: FloatArray, box: Box) -> Any:
     """Return the union of triangles as a shapely geometry.
 
     Very many small triangles are replaced by squares of 0.25 m, because uniting hundreds of thousands of overlapping
@@ -132,7 +132,7 @@ def is_vegetation(kind: str) -> bool:
     return _GREEN.search(kind.lower()) is not None
 
 
-def _shape_rings(shape: Any) -> Iterable[NDArray[np.float64]]:
+def _shape_rings(shape: Any) -> Iterable[FloatArray]:
     import shapely
 
     for part in shapely.get_parts(shape):
@@ -141,7 +141,7 @@ def _shape_rings(shape: Any) -> Iterable[NDArray[np.float64]]:
                 yield shapely.get_coordinates(ring)
 
 
-Line = NDArray[np.float64]
+Line = FloatArray
 """Points, shape (n, 2), world frame, metres."""
 
 SUMO_FOLDER = "sumo"

@@ -25,6 +25,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from egvs.core.grid import BoolArray, FloatArray
+
 _VIRIDIS = (
     "440154", "48186a", "472d7b", "424086", "3b528b", "33638d", "2c728e", "26828e", "21918c",
     "1fa088", "28ae80", "3fbc73", "5ec962", "84d44b", "addc30", "d8e219", "fde725",
@@ -228,7 +230,7 @@ def _theme_rules(theme: Theme, names: Sequence[str]) -> str:
 STYLE_SHEET = _style_sheet()
 """Rules of the figures' classes; a page with figures needs them once."""
 
-ColumnValues = NDArray[np.float64]
+ColumnValues = FloatArray
 """One value per column of voxels, shape (nx, ny)."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -286,7 +288,7 @@ def share_image(share: ColumnValues) -> IndexedImage:
     )
 
 
-def shade_image(shaded: NDArray[np.bool_], max_pixels: int = MAX_PIXELS) -> IndexedImage:
+def shade_image(shaded: BoolArray, max_pixels: int = MAX_PIXELS) -> IndexedImage:
     """Return a shade over columns of voxels, shape (nx, ny), for :data:`SHADE_PALETTES`.
 
     A pixel of several columns is shaded if all of them are.
@@ -296,7 +298,7 @@ def shade_image(shaded: NDArray[np.bool_], max_pixels: int = MAX_PIXELS) -> Inde
     )
 
 
-def dots_image(points_m: NDArray[np.float64], box: tuple[float, float, float, float], across: int) -> IndexedImage:
+def dots_image(points_m: FloatArray, box: tuple[float, float, float, float], across: int) -> IndexedImage:
     """Return the number of points in each cell of a box, for :data:`DOT_PALETTES`.
 
     Parameters

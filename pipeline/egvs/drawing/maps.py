@@ -22,10 +22,9 @@ from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.artefacts.readers import MAX_LOCATIONS, SiteBlindspots
-from egvs.core.grid import Grid
+from egvs.core.grid import BoolArray, FloatArray, Grid
 from egvs.core.wording import format_percent
 from egvs.drawing import colours
 from egvs.drawing.basemap import Outlines, Roads, StreetName
@@ -76,7 +75,7 @@ class SiteViewFigure:
     """A sensor, the voxels that its beams cross (shape (nx, ny, nz)), and the background of the figure."""
 
     site: RankedSite
-    crossed: NDArray[np.bool_]
+    crossed: BoolArray
     backdrop: Backdrop
     box: Box
 
@@ -433,13 +432,13 @@ def _outline_paths(plan: MapFrame, outlines: Sequence[Outlines]) -> str:
     return "".join(paths)
 
 
-def _open_path(plan: MapFrame, line: NDArray[np.float64]) -> str:
+def _open_path(plan: MapFrame, line: FloatArray) -> str:
     """SVG path along points, shape (n, 2), metres."""
     xs, ys = plan.x(line[:, 0]), plan.y(line[:, 1])
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(xs.tolist(), ys.tolist(), strict=True))
 
 
-def _closed_path(plan: MapFrame, ring: NDArray[np.float64]) -> str:
+def _closed_path(plan: MapFrame, ring: FloatArray) -> str:
     return _open_path(plan, ring) + "z"
 
 
@@ -624,7 +623,7 @@ def answer_map(
     backdrop: Backdrop,
     candidates: Sequence[RankedSite],
     poles: Sequence[PlannedPole],
-    views_m: Sequence[NDArray[np.float64]],
+    views_m: Sequence[FloatArray],
     missed: SiteBlindspots | None,
     alt: str,
 ) -> str:

@@ -16,12 +16,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.artefacts import readers
 from egvs.artefacts.readers import MIN_VEHICLES, LocationVisibility, SiteBlindspots
 from egvs.artefacts.tpog import Tpog
-from egvs.core.grid import Grid
+from egvs.core.grid import BoolArray, FloatArray, Grid
 from egvs.core.threads import map_ordered
 from egvs.core.wording import by_number, format_percent
 from egvs.drawing import colours, maps
@@ -173,11 +172,11 @@ class _SiteCoverage:
     """Voxels that the beams of a site cross, and where the beams end."""
 
     scored: RankedSite
-    crossed: NDArray[np.bool_]
+    crossed: BoolArray
     visible_bit: ColumnValues
     missed_bit: ColumnValues
     caption: str
-    ends_m: NDArray[np.float64]
+    ends_m: FloatArray
 
 
 def site_views(
@@ -237,10 +236,10 @@ def _site_coverage(site: RankedSite, beams: Beams, scorer: Scorer) -> _SiteCover
     )
 
 
-def _hit_positions_m(beams: Beams) -> NDArray[np.float64]:
+def _hit_positions_m(beams: Beams) -> FloatArray:
     """Positions where beams hit something, x and y in the world frame, shape (n, 2)."""
     is_hit = np.linalg.norm(beams.ends_m, axis=1) < beams.sensor.range_m * (1 - 1e-9)
-    ends: NDArray[np.float64] = beams.ends_m[is_hit, :2] + np.asarray(beams.pose.position_m[:2])
+    ends: FloatArray = beams.ends_m[is_hit, :2] + np.asarray(beams.pose.position_m[:2])
     return ends
 
 
@@ -248,7 +247,7 @@ _VIEW_STEP_DEG = 2
 """Width of the sectors of a field of view."""
 
 
-def view_outline_m(beams: Beams) -> NDArray[np.float64]:
+def view_outline_m(beams: Beams) -> FloatArray:
     """Return the field of view of a sensor from above, in the world frame, (n, 2).
 
     In each sector of azimuths it reaches as far as the farthest beam that points down: to the ground, to the first
@@ -261,11 +260,11 @@ def view_outline_m(beams: Beams) -> NDArray[np.float64]:
     np.maximum.at(reach_m, np.minimum(sector, len(reach_m) - 1), np.hypot(down_m[:, 0], down_m[:, 1]))
     middle_rad = np.radians((np.arange(len(reach_m)) + 0.5) * _VIEW_STEP_DEG)
     outward = np.column_stack((np.cos(middle_rad), np.sin(middle_rad)))
-    outline_m: NDArray[np.float64] = outward * reach_m[:, None] + np.asarray(beams.pose.position_m[:2])
+    outline_m: FloatArray = outward * reach_m[:, None] + np.asarray(beams.pose.position_m[:2])
     return outline_m
 
 
-def column_entropy(field: EntropyField, which: NDArray[np.bool_]) -> ColumnValues:
+def column_entropy(field: EntropyField, which: BoolArray) -> ColumnValues:
     """Return the entropy of some of the uncertain voxels, summed along z.
 
     Parameters

@@ -12,10 +12,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import NamedTuple, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
-from egvs.core.grid import Grid
+from egvs.core.grid import FloatArray, Grid
 from egvs.core.wording import format_percent
 from egvs.drawing import colours
 from egvs.drawing.colours import LIGHT, STEPS, STYLE_SHEET, Theme, opacity, shape_attributes
@@ -27,7 +24,7 @@ Box = tuple[float, float, float, float]
 
 Rectangle = tuple[float, float, float, float]
 """x, y, width, height, in a figure's units."""
-Metres = TypeVar("Metres", float, NDArray[np.float64])
+Metres = TypeVar("Metres", float, FloatArray)
 
 FONTS = "DejaVu Sans, Arial, Helvetica, sans-serif"
 """Fonts of printed figures."""

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from egvs.core.errors import InputError, RunError
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.core.wording import format_percent
 from egvs.scenario.effects_config import EffectParameters
 from egvs.sensors.beam_hooks import BeamCutter, BeamExpander
@@ -37,10 +38,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from egvs.artefacts.tpog import Tpog
-    from egvs.core.grid import FloatArray, Grid
+    from egvs.core.grid import Grid
     from egvs.scenario.model import Scenario
     from egvs.sensors.scene import Scene
     from egvs.sensors.sensor import Sensor
@@ -69,7 +68,7 @@ class Echoes:
 
     range_m: FloatArray
     cosine: FloatArray
-    is_glass: NDArray[np.bool_]
+    is_glass: BoolArray
     vehicle_draw: FloatArray
 
 

@@ -58,8 +58,7 @@ class Fog(Detect[FogParameters]):
 
     def detect(self, range_m: FloatArray, sensor: Sensor) -> FloatArray:
         """Return exp(-2 alpha r) at the sensor's wavelength."""
-        share: FloatArray = np.exp(-2 * self.extinction_per_m(sensor.wavelength_nm) * range_m)
-        return share
+        return np.exp(-2 * self.extinction_per_m(sensor.wavelength_nm) * range_m)
 
 
 def _kruse_exponent(visibility_km: float) -> float:

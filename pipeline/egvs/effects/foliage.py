@@ -34,7 +34,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 from egvs.effects.base import TransmitScan
 from egvs.kernels import foliage
 from egvs.scenario.effects_config import EffectParameters, FoliageParameters
@@ -133,11 +133,10 @@ def _cast_positions(scene: Scene) -> FloatArray:
     return np.array([site.pose.position_m for site in scene.cast_sites])
 
 
-def _crown_faces(world: World) -> NDArray[np.bool_]:
+def _crown_faces(world: World) -> BoolArray:
     """Which faces belong to closed crowns, (faces,) bool."""
     is_crown = np.array([kind == CROWN for _, kind in world.solids], dtype=np.bool_) & world.closed
-    faces: NDArray[np.bool_] = is_crown[world.solid_of_face]
-    return faces
+    return is_crown[world.solid_of_face]
 
 
 def _crown_boxes(world: World) -> FloatArray:

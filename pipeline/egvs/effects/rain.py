@@ -73,5 +73,4 @@ class Rain(Detect[RainParameters]):
 
     def detect(self, range_m: FloatArray, sensor: Sensor) -> FloatArray:
         """Return exp(-2 alpha r)."""
-        share: FloatArray = np.exp(-2 * self.extinction_per_m() * range_m)
-        return share
+        return np.exp(-2 * self.extinction_per_m() * range_m)

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from egvs.artefacts.tpog import Tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.simulation import MeshPart
-from egvs.core.grid import Grid, Roi, Vec3
+from egvs.core.grid import BoolArray, FloatArray, Grid, Roi, Vec3
 from egvs.core.wording import format_percent, number_of
 from egvs.drawing import colours
 from egvs.drawing.colours import Colour
@@ -38,7 +38,6 @@ from egvs.world.mesh import World
 
 Points = NDArray[np.float32]
 """(n, 3) float32, metres."""
-Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Quaternion = tuple[float, float, float, float]
 """w, x, y, z."""
@@ -122,7 +121,7 @@ def roi_box_lines(roi: Roi, zero_m: Vec3) -> Points:
     return corners[pairs].astype(np.float32)
 
 
-def column_points(tpog: Tpog, values: Floats, zero_m: Vec3, peak: float | None = None) -> tuple[Points, Bytes]:
+def column_points(tpog: Tpog, values: FloatArray, zero_m: Vec3, peak: float | None = None) -> tuple[Points, Bytes]:
     """Sum values along z, and return a point for each column with values.
 
     Parameters
@@ -149,7 +148,7 @@ def column_points(tpog: Tpog, values: Floats, zero_m: Vec3, peak: float | None =
 
 
 def difference_points(
-    tpog: Tpog, this: Floats, other: Floats, zero_m: Vec3, colours: tuple[Colour, Colour, Colour]
+    tpog: Tpog, this: FloatArray, other: FloatArray, zero_m: Vec3, colours: tuple[Colour, Colour, Colour]
 ) -> tuple[Points, Bytes]:
     """Sum two fields along z, and return a point for each column with values, coloured by their difference.
 
@@ -211,7 +210,7 @@ def lift_to_ground(points: Points, world: World, zero_m: Vec3) -> Points:
     return lifted
 
 
-def colour_scale(values: Floats | Sequence[float], low: float | None = None, high: float | None = None) -> Bytes:
+def colour_scale(values: FloatArray | Sequence[float], low: float | None = None, high: float | None = None) -> Bytes:
     """Return the colours of values, (n, 3), on the scale of the report's light theme.
 
     Parameters
@@ -430,7 +429,7 @@ def vehicle_mesh(
     frame: TrafficFrame,
     kinds: Sequence[str],
     parts: Mapping[str, tuple[MeshPart, ...]],
-    selected: NDArray[np.bool_],
+    selected: BoolArray,
     zero_m: Vec3,
 ) -> Mesh:
     """Return some vehicles of a recorded frame as one mesh.
@@ -454,12 +453,12 @@ def vehicle_mesh(
     return Mesh(points, np.arange(len(points), dtype=np.int32).reshape(-1, 3))
 
 
-def _fit_to_box(triangles: Floats, box: Floats, pitch_rad: float) -> Floats:
+def _fit_to_box(triangles: FloatArray, box: FloatArray, pitch_rad: float) -> FloatArray:
     """Scale triangles (m, 3, 3) of the unit box to a box of :data:`egvs.artefacts.traffic_frames.BOX_COLUMNS`."""
     (cy, cp), (sy, sp) = np.cos((box[6], pitch_rad)), np.sin((box[6], pitch_rad))
     yaw = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
     pitch = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]])
-    placed: Floats = (triangles * box[3:6]) @ (yaw @ pitch).T + box[:3]
+    placed: FloatArray = (triangles * box[3:6]) @ (yaw @ pitch).T + box[:3]
     return placed
 
 
@@ -536,7 +535,7 @@ def _draw_traffic(context: LayerContext) -> str:
     points, point_colours = column_points(tpog, tpog.p, context.zero_m)
     context.draw_columns(points, point_colours, tpog.grid.voxel_m)
     peak = float(tpog.p.sum(axis=2).max(initial=0.0))
-    return _scale_legend("share of time for which voxels are occupied by vehicles, summed over height", 0.0, peak)
+    return _scale_legend("share of time for which voxels are occupied by vehicles, summed over height", peak)
 
 
 def _draw_entropy(context: LayerContext) -> str:
@@ -548,7 +547,7 @@ def _draw_entropy(context: LayerContext) -> str:
     points, point_colours = column_points(session.tpog, entropy, context.zero_m, peak)
     context.draw_columns(points, point_colours, session.tpog.grid.voxel_m)
     where = "that beams cross" if draws_seen else "that no beam crosses"
-    return _scale_legend(f"entropy (bits) of voxels {where}, summed over height", 0.0, peak)
+    return _scale_legend(f"entropy (bits) of voxels {where}, summed over height", peak)
 
 
 def _draw_blindspots(context: LayerContext) -> str:
@@ -563,7 +562,7 @@ def _draw_blindspots(context: LayerContext) -> str:
         overall = f"all vehicles: {format_percent(spots.overall.share)} found"
     rows = [f"<b>{_escape_html(overall)}</b>"]
     rows += [_escape_html(f"{location.words}: {format_percent(location.share, 0)} found") for location in spots.worst]
-    return _scale_legend("share of vehicles not found", 0.0, 1.0, partial(format_percent, digits=0)) + text_legend(rows)
+    return _scale_legend("share of vehicles not found", 1.0, partial(format_percent, digits=0)) + text_legend(rows)
 
 
 def _draw_points(context: LayerContext) -> str:
@@ -591,7 +590,9 @@ def _draw_overlap(context: LayerContext) -> str:
     return _draw_classes(context, overlap, overlap.values, labels, title)
 
 
-def _draw_classes(context: LayerContext, points: PointsMap, classes: Floats, labels: Sequence[str], title: str) -> str:
+def _draw_classes(
+    context: LayerContext, points: PointsMap, classes: FloatArray, labels: Sequence[str], title: str
+) -> str:
     """Draw the class of each square metre of a map, and return the legend."""
     ix, iy = np.nonzero(points.on_surface)
     middles = np.column_stack([ix + 0.5, iy + 0.5, np.zeros(len(ix))]) * points.cell_m
@@ -658,7 +659,7 @@ def _draw_replay(context: LayerContext) -> str:
     return text_legend([f"<b>{time_s:,.1f} s of {last_s:,.1f} s</b>"]) + swatch_legend(swatches)
 
 
-def _count_road_users(frame: TrafficFrame, selected: NDArray[np.bool_]) -> str:
+def _count_road_users(frame: TrafficFrame, selected: BoolArray) -> str:
     """Return how many of some boxes are vehicles, and how many are people on foot or on bicycles."""
     is_vehicle = frame.are_vehicles()
     vehicles, people = int((selected & is_vehicle).sum()), int((selected & ~is_vehicle).sum())
@@ -682,11 +683,11 @@ _DRAW_FUNCTIONS: dict[str, Callable[[LayerContext], str]] = {
 }
 
 
-def _scale_legend(title: str, low: float, high: float, format_number: Callable[[float], str] = "{:.3g}".format) -> str:
+def _scale_legend(title: str, high: float, format_number: Callable[[float], str] = "{:.3g}".format) -> str:
     """Return a colour bar with its ends."""
     stops = ", ".join(map(_css_colour, colour_scale(np.linspace(0.0, 1.0, _LEGEND_STEPS)).tolist()))
     bar = f'<div style="height:0.7em;background:linear-gradient(to right, {stops})"></div>'
-    ends = f"<span>{format_number(low)}</span><span>{format_number(high)}</span>"
+    ends = f"<span>{format_number(0.0)}</span><span>{format_number(high)}</span>"
     return _legend_box(f'{title}{bar}<div style="display:flex;justify-content:space-between">{ends}</div>')
 
 

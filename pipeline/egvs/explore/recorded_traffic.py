@@ -16,7 +16,7 @@ from viser.infra import StateSerializer
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.simulation import MeshPart
-from egvs.core.grid import Roi, Vec3
+from egvs.core.grid import BoolArray, FloatArray, Roi, Vec3
 from egvs.core.progress import ProgressCallback
 from egvs.explore import drawing
 from egvs.explore.road_meshes import Mesh
@@ -70,8 +70,8 @@ class TrafficClip:
 
     frames: list[TrafficFrame]
     kinds: list[list[str]]
-    is_visible: list[NDArray[np.bool_]]
-    returns_m: list[NDArray[np.float64]]
+    is_visible: list[BoolArray]
+    returns_m: list[FloatArray]
     step_s: float
     has_returns: bool
 
@@ -93,7 +93,7 @@ class TrafficClip:
         numbers = list(range(0, playback.frames, step))[:count]
         frames = [playback.frame(number) for number in numbers]
         is_visible = [np.zeros(len(frame.boxes), dtype=np.bool_) for frame in frames]
-        returns_m: list[list[NDArray[np.float64]]] = [[] for _ in frames]
+        returns_m: list[list[FloatArray]] = [[] for _ in frames]
         has_returns = False
         for done, site in enumerate(sites):
             for index, frame in enumerate(frames):

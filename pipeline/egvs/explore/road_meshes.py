@@ -17,11 +17,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from egvs.core import polylines
-from egvs.core.grid import Vec3
+from egvs.core.grid import FloatArray, Vec3
 from egvs.traffic.network import LANE_WIDTH_M, Edge, Lane, Network, is_carriageway
 from egvs.world.carriageway import Carriageway
-
-Floats = NDArray[np.float64]
 
 LANE_HEIGHT_M = 0.03
 """Height of a drawn lane above its middle line; junctions are below, markings above."""
@@ -80,7 +78,7 @@ def marking_mesh(network: Network, zero_m: Vec3) -> Mesh:
     zero_m
         Origin of the drawing.
     """
-    strips: list[Floats] = []
+    strips: list[FloatArray] = []
     for edge in network.all_edges:
         if edge.function == "crossing":
             strips += [stripe for lane in edge.lanes for stripe in _crossing_stripes(lane)]
@@ -93,7 +91,7 @@ def _width_m(lane: Lane) -> float:
     return LANE_WIDTH_M if lane.width_m is None else lane.width_m
 
 
-def _lane_markings(edge: Edge) -> list[Floats]:
+def _lane_markings(edge: Edge) -> list[FloatArray]:
     """Return solid lines along both sides of a road, and dashes between its lanes."""
     lanes = [lane for lane in edge.lanes if is_carriageway(lane.permission) and len(lane.shape_m) > 1]
     if not lanes:
@@ -109,38 +107,38 @@ def _lane_markings(edge: Edge) -> list[Floats]:
     return strips + [_strip(line, _LINE_WIDTH_M) for line in outer]
 
 
-def _sides(lane: Lane) -> tuple[Floats, Floats]:
+def _sides(lane: Lane) -> tuple[FloatArray, FloatArray]:
     """Return the left and the right side of a lane, (n, 3) each."""
     corners = _strip(lane.shape_m, _width_m(lane))
     return corners[::2], corners[1::2]
 
 
-def _nearer_side(lane: Lane, other: Lane) -> Floats:
+def _nearer_side(lane: Lane, other: Lane) -> FloatArray:
     return min(_sides(lane), key=lambda side: _distance_m(side, other))
 
 
-def _farther_side(lane: Lane, other: Lane) -> Floats:
+def _farther_side(lane: Lane, other: Lane) -> FloatArray:
     return max(_sides(lane), key=lambda side: _distance_m(side, other))
 
 
-def _distance_m(side: Floats, other: Lane) -> float:
+def _distance_m(side: FloatArray, other: Lane) -> float:
     return float(np.hypot(*(side[0, :2] - other.shape_m[0, :2])))
 
 
-def _dashes(line: Floats) -> Iterator[Floats]:
+def _dashes(line: FloatArray) -> Iterator[FloatArray]:
     """Yield the dashes of a broken line (n, 3); corners between their ends are cut."""
     for start_m in np.arange(0.0, polylines.stations_m(line)[-1] - _DASH_M, _DASH_M + _GAP_M):
         yield polylines.points_at(line, (start_m, start_m + _DASH_M))
 
 
-def _crossing_stripes(lane: Lane) -> Iterator[Floats]:
+def _crossing_stripes(lane: Lane) -> Iterator[FloatArray]:
     """Yield the stripes of a crossing, as strips across its middle line."""
     line = lane.shape_m
     for start_m in np.arange(_STRIPE_M / 2.0, polylines.stations_m(line)[-1] - _STRIPE_M, 2.0 * _STRIPE_M):
         yield _strip(polylines.points_at(line, (start_m, start_m + _STRIPE_M)), _width_m(lane))
 
 
-def _strip(line: Floats, width_m: float) -> Floats:
+def _strip(line: FloatArray, width_m: float) -> FloatArray:
     """Return points left and right of each point of a line (n, 3) in turn, (2 n, 3)."""
     along = np.gradient(line[:, :2], axis=0)
     along /= np.maximum(np.hypot(*along.T), np.finfo(np.float64).tiny)[:, None]
@@ -148,7 +146,7 @@ def _strip(line: Floats, width_m: float) -> Floats:
     return np.stack([line + across, line - across], axis=1).reshape(-1, 3)
 
 
-def _join_strips(strips: Iterable[Floats], zero_m: Vec3, height_m: float) -> Mesh:
+def _join_strips(strips: Iterable[FloatArray], zero_m: Vec3, height_m: float) -> Mesh:
     """Return strips as one mesh, lifted by ``height_m``."""
     points, faces, count = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int32)], 0
     for strip in strips:

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.artefacts import parquet, traffic_frames
 from egvs.artefacts.readers import (
@@ -32,7 +31,7 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds import simulation as cloud_simulation
 from egvs.clouds.simulation import CloudSimulator, VehicleMeshes, sweep_rng
 from egvs.core.errors import Diagnostic, InputError, choose_one
-from egvs.core.grid import Grid
+from egvs.core.grid import BoolArray, FloatArray, Grid, IntArray
 from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.effects.returns import ReturnProbability
@@ -60,9 +59,6 @@ from egvs.stages.base import StageContext
 from egvs.stages.inputs import CheckInputs
 from egvs.stages.points_maps import target_positions
 from egvs.stages.site_scoring import TargetScorer
-
-Floats = NDArray[np.float64]
-
 
 _SCORES = RunFolder.scores.name
 
@@ -346,7 +342,7 @@ class Session:
         rank = 1 + sum(other > score for other in others)
         return PoseScore(site, scores, rank, findings)
 
-    def hits(self, site: Site) -> Floats:
+    def hits(self, site: Site) -> FloatArray:
         """Return the number of beams of a sensor that cross each voxel, (nx, ny, nz) float64.
 
         This and the following methods raise an InputError if no sensor can be mounted there.
@@ -358,12 +354,12 @@ class Session:
         """Return the empty scan of a sensor, as scores use it."""
         return Beams.of(self._engine(site).scanner.scan_site(site))
 
-    def returns_m(self, site: Site) -> Floats:
+    def returns_m(self, site: Site) -> FloatArray:
         """Return the points of the empty scan, (n, 3) float64, world frame."""
         rows = self._engine(site).scanner.scan_site(site).rows
         return rows.ends_m[rows.returned] + site.pose.position_m
 
-    def beams_m(self, site: Site, ring: int) -> Floats:
+    def beams_m(self, site: Site, ring: int) -> FloatArray:
         """Return start and end of the beams of one ring that can meet the region, (n, 2, 3) float64, world frame.
 
         Parameters
@@ -417,7 +413,7 @@ class Session:
         return self._engine(site).scene
 
     @cached_property
-    def entropy_bit(self) -> Floats:
+    def entropy_bit(self) -> FloatArray:
         """Entropy of each voxel, (nx, ny, nz) float64."""
         field = EntropyField.of(self.tpog.counts, self.tpog.frames, self.tpog.grid)
         entropy = np.zeros(self.tpog.counts.size)
@@ -548,11 +544,11 @@ class PlaybackFrame:
     """
 
     frame: TrafficFrame
-    returns_m: Floats
-    owner: NDArray[np.int64]
+    returns_m: FloatArray
+    owner: IntArray
 
     @property
-    def is_visible(self) -> NDArray[np.bool_]:
+    def is_visible(self) -> BoolArray:
         """Whether each box has enough returns, (boxes,)."""
         counts = np.bincount(self.owner[self.owner >= 0], minlength=len(self.frame.boxes))
         return np.asarray(counts >= SEEN_WELL_POINTS)

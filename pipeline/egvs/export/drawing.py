@@ -30,8 +30,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.drawing.basemap import network_file, roads_within, solid_group
 from egvs.export.finished_run import ExportCrs, FinishedRun
 from egvs.export.layers import FOOTPRINTS, PLAN, REGION, SITES, Layer
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from egvs.drawing.svg_figures import Box
 
-Points = NDArray[np.float64]
+Points = FloatArray
 
 MAP_MARGIN_M = 60.0
 """The base map reaches this far beyond the region of interest and the sites."""
@@ -200,7 +200,7 @@ def ground_view(sensor: Sensor, pose: Pose, height_m: float) -> View:
     return View(center + outer_m[order, None] * unit[order], inner_points_m, is_full_circle)
 
 
-def _from_widest_gap(has_beam: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _from_widest_gap(has_beam: BoolArray) -> IntArray:
     """Return the sectors with beams, counter-clockwise, beginning after the widest gap."""
     order = np.flatnonzero(has_beam)
     gaps = np.diff(order, append=order[0] + len(has_beam))

@@ -20,13 +20,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from egvs.core.grid import FloatArray
 from egvs.export.finished_run import ExportCrs
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose, grid_bearing_deg
 
-Matrix = NDArray[np.float64]
+Matrix = FloatArray
 
 R_GLTF_WORLD: Matrix = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """From the world frame (z up) to glTF's frame (y up): (x, y, z) becomes (x, z, -y)."""
@@ -138,8 +138,7 @@ def transform_gltf_sensor(pose: Pose, origin_m: Matrix) -> Matrix:
     matrix[:3, 3] -= origin_m
     to_gltf = np.eye(4)
     to_gltf[:3, :3] = R_GLTF_WORLD
-    combined: Matrix = to_gltf @ matrix
-    return combined
+    return to_gltf @ matrix
 
 
 def extrinsics_document(

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
 from egvs.formats import georeference
 from egvs.formats.georeference import WorldFrame
 from egvs.results.plans import SensorPlan
@@ -125,8 +125,6 @@ class FinishedRun:
         return self.work.path(name)
 
 
-Floats = NDArray[np.float64]
-
 SCENARIO_CRS, WGS84_CRS = "scenario", "wgs84"
 CRS_CHOICES = (SCENARIO_CRS, WGS84_CRS)
 
@@ -191,16 +189,16 @@ class ExportCrs:
         """Whether coordinates are local metres, with an unknown position on the Earth."""
         return self.frame is None
 
-    def from_world(self, xy_m: Floats) -> Floats:
+    def from_world(self, xy_m: FloatArray) -> FloatArray:
         """Return coordinates of world-frame positions in metres; both of shape (n, 2)."""
         if self.frame is None:
             return xy_m
         if self.is_degrees:
             return np.round(self.frame.to_degrees(xy_m), _DIGITS_DEG)
-        eastings: Floats = np.subtract(xy_m, self.frame.offset_m, dtype=np.float64)
+        eastings: FloatArray = np.subtract(xy_m, self.frame.offset_m, dtype=np.float64)
         return np.round(eastings, _DIGITS_M)
 
-    def to_world(self, xy: Floats) -> Floats:
+    def to_world(self, xy: FloatArray) -> FloatArray:
         """Return world-frame positions in metres of coordinates; both of shape (n, 2)."""
         if self.frame is None:
             return xy

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.drawing import colours
 from egvs.drawing.basemap import network_file, union_of_triangles
 from egvs.export.finished_run import FinishedRun
@@ -72,7 +73,7 @@ class Layer:
     colours_by: str = ""
     emphasises_low: bool = False
     initial_site: str = ""
-    ground_m: NDArray[np.float64] | None = None
+    ground_m: FloatArray | None = None
 
     @property
     def has_points(self) -> bool:
@@ -141,7 +142,7 @@ _KML_REASONS = {
 }  # fmt: skip
 
 
-def ground_heights_m(world: World, rows: pa.Table) -> NDArray[np.float64]:
+def ground_heights_m(world: World, rows: pa.Table) -> FloatArray:
     """Return z of the ground below the points in the columns x_m and y_m of a table, shape (n,)."""
     points = zip(rows.column("x_m").to_pylist(), rows.column("y_m").to_pylist(), strict=True)
     return np.array([ground_height_m(world, Pose(x_m, y_m, 0.0)) for x_m, y_m in points], dtype=np.float64)
@@ -156,7 +157,7 @@ def _best_on_poles(scores: pa.Table) -> list[str]:
     return list(best.values())
 
 
-def _is_in_range(run: FinishedRun, scores: pa.Table, layer: Layer) -> NDArray[np.bool_]:
+def _is_in_range(run: FinishedRun, scores: pa.Table, layer: Layer) -> BoolArray:
     """Return which geometries of a layer a beam of any sensor can reach, seen from above."""
     import shapely
 
@@ -270,7 +271,7 @@ def _footprint_layers(run: FinishedRun) -> Iterator[Layer]:
         yield Layer(FOOTPRINTS, np.array(shapes, dtype=object), pa.Table.from_pylist(rows))
 
 
-def _with_area(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _with_area(triangles: FloatArray) -> FloatArray:
     """Triangles, shape (n, 3, 2), without those that are seen edge-on."""
     a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     return triangles[np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > _MIN_AREA_M2]

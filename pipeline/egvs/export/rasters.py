@@ -26,7 +26,7 @@ from egvs.artefacts import readers
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import read_tpog
 from egvs.core import files
-from egvs.core.grid import Grid
+from egvs.core.grid import FloatArray, Grid
 from egvs.drawing import colours
 from egvs.drawing.run_figures import column_entropy
 from egvs.export.finished_run import ExportCrs, FinishedRun
@@ -36,7 +36,7 @@ from egvs.stages.plan_scans import plan_beams
 from egvs.stages.points_maps import points_maps, target_positions
 from egvs.stages.site_scans import empty_scans
 
-CellValues = NDArray[np.float64]
+CellValues = FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ class GeoRaster:
         Size of a cell.
     """
 
-    values: NDArray[np.float64]
+    values: FloatArray
     west: float
     north: float
     width: float
@@ -172,7 +172,7 @@ def georeference(raster: Raster, reference: ExportCrs) -> GeoRaster:
     )
 
 
-def _rectangle_border(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rectangle_border(low: FloatArray, high: FloatArray) -> FloatArray:
     """Points along the edges of a rectangle, shape (n, 2): in degrees the edges are curves."""
     share = np.linspace(0.0, 1.0, 21)
     x, y = low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])
@@ -180,14 +180,12 @@ def _rectangle_border(low: NDArray[np.float64], high: NDArray[np.float64]) -> ND
     return np.vstack([np.column_stack(side) for side in sides])
 
 
-def _cell_counts(
-    reference: ExportCrs, west_south: NDArray[np.float64], east_north: NDArray[np.float64], cell: float
-) -> NDArray[np.float64]:
+def _cell_counts(reference: ExportCrs, west_south: FloatArray, east_north: FloatArray, cell: float) -> FloatArray:
     """Width and height of a box in degrees, in cells of ``cell`` metres."""
     (west, south), (east, north) = west_south, east_north
     corners = np.array([[west, south], [east, south], [west, north]])
     metres = reference.to_world(corners)
-    counts: NDArray[np.float64] = np.hypot(*(metres[1:] - metres[0]).T) / cell
+    counts: FloatArray = np.hypot(*(metres[1:] - metres[0]).T) / cell
     return counts
 
 

@@ -22,10 +22,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
+from egvs.core.grid import FloatArray, IntArray
 from egvs.drawing.basemap import solid_group
 from egvs.export.extrinsics import (
     R_GLTF_WORLD,
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
     from egvs.world.mesh import World
 
-Floats = NDArray[np.float64]
 
 GLTF_FILE, USD_FILE, EXTRINSICS_FILE = "scene.glb", "scene.usdc", "extrinsics.json"
 WORLD_NODE = SCENE_NODE
@@ -61,8 +60,8 @@ class SceneMesh:
     """The triangles of one kind of solid: ``vertices_m`` (n, 3) in the scene frame, ``faces`` (m, 3)."""
 
     kind: str
-    vertices_m: Floats
-    faces: NDArray[np.int64]
+    vertices_m: FloatArray
+    faces: IntArray
 
     @property
     def colour(self) -> tuple[int, int, int]:
@@ -109,7 +108,7 @@ def posed_sensors(run: FinishedRun) -> list[PosedSensor]:
     return [PosedSensor(site.site, site.sensor, planned.get(site.site, site.pose), site.rank) for site in sites]
 
 
-def scene_origin_m(run: FinishedRun) -> Floats:
+def scene_origin_m(run: FinishedRun) -> FloatArray:
     """Return the origin of the scene in the world frame, (3,): 0, or the centre of the region if that is far away."""
     center_m = np.round(np.asarray(run.scenario.roi.center_m, dtype=np.float64))
     if np.abs(center_m).max() <= MAX_FLOAT32_M:
@@ -117,7 +116,7 @@ def scene_origin_m(run: FinishedRun) -> Floats:
     return np.array([center_m[0], center_m[1], 0.0])
 
 
-def scene_meshes(world: World, origin_m: Floats) -> list[SceneMesh]:
+def scene_meshes(world: World, origin_m: FloatArray) -> list[SceneMesh]:
     """Return one mesh per kind of solid, in the order of their names."""
     meshes = []
     kinds = np.array([kind for _, kind in world.solids], dtype=str)
@@ -129,7 +128,7 @@ def scene_meshes(world: World, origin_m: Floats) -> list[SceneMesh]:
     return meshes
 
 
-def make_gltf(meshes: Sequence[SceneMesh], sensors: Sequence[PosedSensor], origin_m: Floats) -> bytes:
+def make_gltf(meshes: Sequence[SceneMesh], sensors: Sequence[PosedSensor], origin_m: FloatArray) -> bytes:
     """Return a scene as binary glTF; parameters as those of the module."""
     import trimesh
 
@@ -149,7 +148,7 @@ def make_gltf(meshes: Sequence[SceneMesh], sensors: Sequence[PosedSensor], origi
     return exported
 
 
-def _add(scene: Any, name: str, mesh: trimesh.Trimesh, matrix: Floats, colour: tuple[int, int, int]) -> None:
+def _add(scene: Any, name: str, mesh: trimesh.Trimesh, matrix: FloatArray, colour: tuple[int, int, int]) -> None:
     import trimesh
 
     visual: Any = trimesh.visual
@@ -160,7 +159,7 @@ def _add(scene: Any, name: str, mesh: trimesh.Trimesh, matrix: Floats, colour: t
     scene.add_geometry(mesh, node_name=name, geom_name=name, parent_node_name=WORLD_NODE, transform=matrix)
 
 
-def _scene_matrix(sensor: PosedSensor, origin_m: Floats) -> Floats:
+def _scene_matrix(sensor: PosedSensor, origin_m: FloatArray) -> FloatArray:
     """T_scene_sensor, (4, 4)."""
     matrix = transform_world_sensor(sensor.pose)
     matrix[:3, 3] -= origin_m
@@ -188,7 +187,7 @@ def _unique(name: str, used: set[str]) -> str:
     return unique
 
 
-def _write_usd(path: Path, meshes: Sequence[SceneMesh], sensors: Sequence[PosedSensor], origin_m: Floats) -> None:
+def _write_usd(path: Path, meshes: Sequence[SceneMesh], sensors: Sequence[PosedSensor], origin_m: FloatArray) -> None:
     from pxr import Gf, Usd, UsdGeom
 
     stage = Usd.Stage.CreateNew(str(path))

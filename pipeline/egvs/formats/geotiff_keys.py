@@ -175,8 +175,7 @@ class GeoKeys:
 
         code = self._code(_CONVERSION)
         if code is not None:
-            conversion: dict[str, Any] = CoordinateOperation.from_epsg(code).to_json_dict()
-            return conversion
+            return CoordinateOperation.from_epsg(code).to_json_dict()
         method = self._code(_METHOD)
         if method is None:
             return None
@@ -229,8 +228,7 @@ class GeoKeys:
 
         code = self._code(_DATUM)
         if code is not None:
-            datum: dict[str, Any] = Datum.from_epsg(code).to_json_dict()
-            return datum
+            return Datum.from_epsg(code).to_json_dict()
         code = self._code(_ELLIPSOID)
         half_axis_m = self._number(_HALF_AXIS)
         name = self._text(_GEOGRAPHIC_CITATION, default="user-defined")

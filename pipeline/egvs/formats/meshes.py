@@ -26,12 +26,11 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core import limits, reading
 from egvs.core.digests import hash_input, unchanged_inputs
 from egvs.core.errors import InputError
-from egvs.core.grid import IntArray
+from egvs.core.grid import BoolArray, IntArray
 from egvs.core.platform import relative_path
 from egvs.core.reading import translate_errors
 
@@ -391,7 +390,7 @@ def mesh_components(adjacent: IntArray, triangles: int) -> IntArray:
     return rank[label_index]
 
 
-def are_closed(faces: IntArray, component: IntArray) -> NDArray[np.bool_]:
+def are_closed(faces: IntArray, component: IntArray) -> BoolArray:
     """Return which components are closed, (components,).
 
     A component is closed when each of its edges is in exactly two of its triangles, in opposite directions.

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from egvs.core import limits, readers
 from egvs.core.errors import EgvsError, InputError, MissingBackendError
 from egvs.core.files import atomic_write
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.core.numbers import parse_decimal
 from egvs.core.readers import Reader
 from egvs.core.reading import COMPLETE_FILE, describe_exception, translate_errors
@@ -103,7 +103,7 @@ CLASS_FIELDS = ("classification", "Classification", "scalar_Classification")
 """Names of the field with the class of LAS in PCD and PLY files of PDAL and CloudCompare."""
 
 
-def drop_marked(points_m: FloatArray, marks: Mapping[str, NDArray[np.bool_]]) -> dict[str, int]:
+def drop_marked(points_m: FloatArray, marks: Mapping[str, BoolArray]) -> dict[str, int]:
     """Set points, (n, 3), with a mark to NaN in place, and return how many have each mark; the first one counts."""
     counts = {}
     left = np.ones(len(points_m), dtype=np.bool_)

@@ -223,7 +223,11 @@ class PlanErrors:
             self._target_groups = _target_groups(context, view, periods)
         blocks = tuple(block_groups(period) for period in periods)
         self._groups = blocks + self._replicates.detector_groups
-        self._candidates = _replicates_of_candidates(context, placement_problem, self._replicates)
+        # They only decide which groups of blocks are joined, so those of single detectors are those of all detectors.
+        of_candidate = partial(self._replicates.of_candidate, placement_problem.problem.joint)
+        rows = np.array(list(map_ordered(of_candidate, range(len(placement_problem.sites)), context.threads)))
+        n_detectors = sum(len(group.frames) for group in self._replicates.detector_groups)
+        self._candidates = np.column_stack([rows, np.repeat(rows[:, :1], n_detectors, axis=1)])
         if np.isnan(self._candidates).any():
             self.source = "without one of the blocks of frames there are no vehicles"
             return
@@ -296,17 +300,3 @@ def _why_unknown(periods: Sequence[PeriodBlocks], *, standard_error: bool) -> st
     if any(period.blocks < 2 for period in periods):
         return "the traffic has a single block of frames (tpog.blocks)"
     return ""
-
-
-def _replicates_of_candidates(
-    context: StageContext, placement_problem: PlacementProblem, replicates: PlanReplicates
-) -> FloatArray:
-    """Return the replicates of each candidate alone, (n, 1 + k + d) float64.
-
-    They only decide which groups of blocks are joined, so their scores without a detector are not computed: they are
-    those of all detectors.
-    """
-    of_candidate = partial(replicates.of_candidate, placement_problem.problem.joint)
-    rows = np.array(list(map_ordered(of_candidate, range(len(placement_problem.sites)), context.threads)))
-    n_detectors = sum(len(group.frames) for group in replicates.detector_groups)
-    return np.column_stack([rows, np.repeat(rows[:, :1], n_detectors, axis=1)])

@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts.tpog import Tpog
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.core.threads import map_ordered
 from egvs.core.wording import number_of
 from egvs.kernels import submodular
@@ -48,8 +48,6 @@ from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import OccupiedVoxels
 from egvs.scoring.target_scores import log_points, saturating_gain
 from egvs.scoring.targets import SEEN_WELL_POINTS, weighted_mean
-
-BoolArray = NDArray[np.bool_]
 
 Plan = tuple[int, ...]
 """Indices of candidates."""
@@ -559,8 +557,7 @@ def target_values(score: str, totals: IntArray, unit: float) -> FloatArray:
         return log_points(totals / unit)
     if score == "seen_well":
         return saturating_gain(totals / unit)
-    values: FloatArray = -np.expm1(-(totals / unit))
-    return values
+    return -np.expm1(-(totals / unit))
 
 
 class CoverageState:
@@ -652,10 +649,8 @@ class Demand:
         """Share of the demand that values fall short by, 0 to 1."""
         missing = np.maximum(self.least - np.asarray(reached), 0.0)
         if not self.least:
-            no_share: FloatArray = 0 * missing
-            return no_share
-        share: FloatArray = np.where(missing > _DEMAND_TOLERANCE * self.least, missing / self.least, 0.0)
-        return share
+            return 0 * missing
+        return np.where(missing > _DEMAND_TOLERANCE * self.least, missing / self.least, 0.0)
 
 
 @dataclass(frozen=True, order=True)

@@ -25,10 +25,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.core.threads import map_ordered
 from egvs.placement.problem import Plan, PlanRules, PlanValue, Problem, VisibilityMatrix, VisibilityRow
 from egvs.placement.problem_builder import PlacementProblem, candidate_costs
@@ -560,12 +559,12 @@ class _PoseEvaluator:
         self._views = placement_problem.views
         self._scanner = Scanner(self._scene)
 
-    def on_roads(self, sites: Sequence[Site]) -> NDArray[np.bool_]:
+    def on_roads(self, sites: Sequence[Site]) -> BoolArray:
         """Which sites are in a lane or a junction, (n,) bool; none if candidates are not checked for it either."""
         if self._carriageway is None or not sites:
             return np.zeros(len(sites), dtype=np.bool_)
         positions_m = np.array([site.pose.position_m for site in sites])
-        in_lane: NDArray[np.bool_] = np.array([lane is not None for lane in self._carriageway.lanes_at(positions_m)])
+        in_lane: BoolArray = np.array([lane is not None for lane in self._carriageway.lanes_at(positions_m)])
         return in_lane | self._carriageway.in_junctions(positions_m[:, :2])
 
     @cached_property
@@ -599,11 +598,10 @@ class _PoseEvaluator:
         return None if network is None else Carriageway.of(network)
 
 
-def _ground_faces(world: World) -> NDArray[np.bool_]:
+def _ground_faces(world: World) -> BoolArray:
     """Return which faces are ground, (n,)."""
     is_ground = np.array([solid == ("ground", "ground") for solid in world.solids], dtype=np.bool_)
-    faces: NDArray[np.bool_] = is_ground[world.solid_of_face]
-    return faces
+    return is_ground[world.solid_of_face]
 
 
 class _SensorSearch:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from egvs.core import polylines
+from egvs.core.grid import FloatArray
 from egvs.drawing import maps
 from egvs.drawing.basemap import roads_within
 from egvs.drawing.svg_figures import Box, MapFrame, text_width
@@ -21,7 +22,7 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_queues import approach_paths
 from egvs.traffic.approaches import ApproachIndex, ApproachMovement
-from egvs.traffic.directions import U_TURN, Floats
+from egvs.traffic.directions import U_TURN
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import read_net_xml
 
@@ -40,7 +41,7 @@ _WIDTH = 420.0
 class ApproachLabel:
     """An approach on the map: where it is (2,), its name, and vehicles per hour by turn."""
 
-    at_m: Floats
+    at_m: FloatArray
     name: str
     per_hour: Mapping[str, float]
 

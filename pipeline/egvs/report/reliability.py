@@ -152,6 +152,7 @@ def _limits(best: RankedSite, on_pole: Sequence[RankedSite]) -> Iterator[str]:
 _BY_SEVERITY = (
     ("no vehicles",),
     ("no ranking",),
+    ("traffic in the region",),
     (
         "overlaps in roi",
         "overlaps",
@@ -165,8 +166,8 @@ _BY_SEVERITY = (
     ("sites on lanes", "blocked sites", "measured scan", "vehicles off their lanes", "vehicles against lanes"),
     ("mesh units", "mesh axes", "few beams", "beam angles", "upward beams", "blind sites", "track alignment"),
 )
-"""Rules of warnings that make a result worthless, that tell of traffic that cannot be, of sites where no sensor can
-stand, and of scenes that are not as they are in reality; all other warnings are less serious."""
+"""Rules of warnings that make a result worthless or uncertain, that tell of traffic that cannot be, of sites where no
+sensor can stand, and of scenes that are not as they are in reality; all other warnings are less serious."""
 
 
 def by_severity(warnings: Iterable[Diagnostic]) -> list[Diagnostic]:

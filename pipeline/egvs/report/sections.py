@@ -86,11 +86,12 @@ _BY_IMPORTANCE = (
 """Beginnings of what scenarios assume, that which affects a ranking most first; all other entries follow."""
 
 
+_NAMED_ASSUMPTIONS = 2
 _LONG = 75
 """Longer lists of assumptions leave out what is in brackets, except sides of approaches, and name one of several."""
 
 
-def main_assumptions(assumed: Sequence[str], count: int = 2) -> str:
+def main_assumptions(assumed: Sequence[str]) -> str:
     """Return the assumptions that affect a ranking most, and how many more there are, in one sentence.
 
     Empty where nothing is assumed. ``assumed`` is from :func:`assumptions`.
@@ -102,10 +103,10 @@ def main_assumptions(assumed: Sequence[str], count: int = 2) -> str:
     if not assumed:
         return ""
     entries = sorted(assumed, key=order)
-    named = list_first(entries, count, "; ")
+    named = list_first(entries, _NAMED_ASSUMPTIONS, "; ")
     if len(named) > _LONG:
         without_lists = [re.sub(r"(: [^,]+), .*", r"\1 and others", entry) for entry in entries]
-        named = re.sub(rf" \((?!{'|'.join(COMPASS)})[^)]*\)", "", list_first(without_lists, count, "; "))
+        named = re.sub(rf" \((?!{'|'.join(COMPASS)})[^)]*\)", "", list_first(without_lists, _NAMED_ASSUMPTIONS, "; "))
     return f"Assumed, not measured: {named}."
 
 

@@ -7,7 +7,7 @@ from html import escape
 from typing import Any
 
 from egvs.core.wording import shorten_id
-from egvs.drawing.svg_figures import PAGE_STYLE, FigureStyle, round_values, svg_start_tag, text_width
+from egvs.drawing.svg_figures import PAGE_STYLE, round_values, svg_start_tag, text_width
 from egvs.traffic.signal_descriptions import plan_title
 
 _TOP, _BOTTOM, _ROW, _RIGHT = 8.0, 44.0, 22.0, 16.0
@@ -38,27 +38,25 @@ def signal_diagrams(plans: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, 
     return diagrams
 
 
-def stage_diagram(plan: Mapping[str, Any], style: FigureStyle = PAGE_STYLE) -> str:
+def stage_diagram(plan: Mapping[str, Any]) -> str:
     """Return the bars of all movements over one cycle: green, paler where it gives way, yellow, and a line for red.
 
     Parameters
     ----------
     plan
         A plan of :func:`egvs.traffic.signal_descriptions.describe_signals`.
-    style
-        Width and colours.
     """
     rows = plan["rows"]
     names = [_row_name(row) for row in rows]
     left = 15.0 + max(text_width(name) for name in names)
-    width = style.width - left - _RIGHT
+    width = PAGE_STYLE.width - left - _RIGHT
     base = _TOP + _ROW * len(rows)
     scale = width / plan["cycle_s"]
     alt = f"Stage diagram of the signals at {plan_title(plan)}: {_greens_in_words(rows)}"
-    parts = [svg_start_tag(style.width, base + _BOTTOM, alt, style)]
+    parts = [svg_start_tag(PAGE_STYLE.width, base + _BOTTOM, alt, PAGE_STYLE)]
     for value, text in round_values(0.0, plan["cycle_s"], max(2, int(width // 70))):
         x = left + scale * value
-        parts.append(f'<path {style.shape("grid")} d="M{x:.1f} {_TOP:.1f}V{base:.1f}"/>')
+        parts.append(f'<path {PAGE_STYLE.shape("grid")} d="M{x:.1f} {_TOP:.1f}V{base:.1f}"/>')
         parts.append(f'<text x="{x:.1f}" y="{base + 17:.1f}" text-anchor="middle">{text}</text>')
     for number, (row, name) in enumerate(zip(rows, names, strict=True)):
         y = _TOP + _ROW * number
@@ -67,7 +65,7 @@ def stage_diagram(plan: Mapping[str, Any], style: FigureStyle = PAGE_STYLE) -> s
         line = f'd="M{left:.1f} {middle:.1f}H{left + width:.1f}"'
         parts.append(f'<path style="stroke:{_RED};stroke-width:2.5;fill:none" {line}/>')
         parts += _bars(row, left, y, scale)
-    parts.append(f'<path {style.shape("axis")} d="M{left:.1f} {_TOP:.1f}V{base:.1f}H{left + width:.1f}"/>')
+    parts.append(f'<path {PAGE_STYLE.shape("axis")} d="M{left:.1f} {_TOP:.1f}V{base:.1f}H{left + width:.1f}"/>')
     parts.append(
         f'<text x="{left + width / 2:.1f}" y="{base + 36:.1f}" text-anchor="middle">seconds in the cycle</text>'
     )

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts.command_results import read_results
-from egvs.artefacts.run_record import StageRecord
+from egvs.artefacts.run_record import StageRecord, have_inputs
 from egvs.core import files
 from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
@@ -60,6 +60,6 @@ def current_entries(
     """
     entries = {}
     for name, result in read_results(path).items():
-        if result.is_current(stages) and digest(result.values) == result.values.get(DIGEST_KEY):
+        if have_inputs(stages, result.stages) and digest(result.values) == result.values.get(DIGEST_KEY):
             entries[name] = result.values
     return entries

@@ -405,7 +405,6 @@ class Scenario(StrictModel):
             period = self.traffic.periods[number]
             drawn = int(np.random.SeedSequence((self.seed, number)).generate_state(1, np.uint64)[0])
             scenario = self.model_copy(update={"traffic": traffic, "seed": drawn >> 1})
-            scenario._folders = self._folders
             scenario._period = name
             scenario._period_keys = frozenset(period.model_fields_set)
             scenarios[name] = scenario
@@ -431,11 +430,7 @@ class Scenario(StrictModel):
             if number:
                 sequence = np.random.SeedSequence(self.seed, spawn_key=(_SEEDS_STREAM, number))
                 seed = int(sequence.generate_state(1, np.uint64)[0]) >> 1
-            scenario = self.model_copy(update={"traffic": traffic, "seed": seed})
-            scenario._folders = self._folders
-            scenario._period = self._period
-            scenario._period_keys = self._period_keys
-            scenarios.append(scenario)
+            scenarios.append(self.model_copy(update={"traffic": traffic, "seed": seed}))
         return tuple(scenarios)
 
     @property
@@ -494,11 +489,7 @@ class Scenario(StrictModel):
     def with_effects(self, effects: EffectsConfig) -> Scenario:
         """Return the same scenario with other effects; gamma keeps its number, even if it was "auto"."""
         score = self.score.model_copy(update={"gamma": self.gamma})
-        scenario = self.model_copy(update={"effects": effects, "score": score})
-        scenario._folders = self._folders
-        scenario._period = self._period
-        scenario._period_keys = self._period_keys
-        return scenario
+        return self.model_copy(update={"effects": effects, "score": score})
 
     def find(self, name: str, key: str) -> Path:
         """Return the path of a file that the scenario, or one that it extends, names.

@@ -22,17 +22,8 @@ import numpy as np
 
 from egvs.artefacts import parquet, readers
 from egvs.artefacts.parquet import ArtefactWriter
-from egvs.core.grid import Grid, Roi
-from egvs.scoring.road_locations import (
-    KINDS,
-    Floats,
-    Ints,
-    RoadLocation,
-    RoadLocations,
-    disambiguate,
-    fronts_m,
-    match_lanes,
-)
+from egvs.core.grid import FloatArray, Grid, IntArray, Roi
+from egvs.scoring.road_locations import KINDS, RoadLocation, RoadLocations, disambiguate, fronts_m, match_lanes
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord
 
 CELL_M = 1.0
@@ -59,9 +50,9 @@ class SpotVisibility:
         Number of vehicle-frames with at least :data:`egvs.scoring.targets.SEEN_WELL_POINTS` points, (k,) int64.
     """
 
-    share: Floats
-    se: Floats
-    with_points: Ints
+    share: FloatArray
+    se: FloatArray
+    with_points: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,15 +77,17 @@ class VehicleSpots:
     """
 
     locations: tuple[RoadLocation, ...]
-    cells: Ints
-    at_m: Floats
-    row: Ints
-    visit: Ints
-    spot: Ints
-    weight: Floats
+    cells: IntArray
+    at_m: FloatArray
+    row: IntArray
+    visit: IntArray
+    spot: IntArray
+    weight: FloatArray
 
     @classmethod
-    def of(cls, record: TargetRecord, roads: RoadLocations | None, weight: Floats, period: Ints) -> VehicleSpots:
+    def of(
+        cls, record: TargetRecord, roads: RoadLocations | None, weight: FloatArray, period: IntArray
+    ) -> VehicleSpots:
         """Find the spots of the vehicle-frames of a record.
 
         Parameters
@@ -123,10 +116,10 @@ class VehicleSpots:
         cls,
         record: TargetRecord,
         locations: Sequence[RoadLocation],
-        row: Ints,
-        spot: Ints,
-        weight: Floats,
-        period: Ints,
+        row: IntArray,
+        spot: IntArray,
+        weight: FloatArray,
+        period: IntArray,
     ) -> VehicleSpots:
         """Return spots without cells, from pairs of a vehicle-frame ``row`` and its ``spot``, (m,) int64 each.
 
@@ -145,25 +138,25 @@ class VehicleSpots:
         return len(self.at_m)
 
     @property
-    def vehicle_frames(self) -> Ints:
+    def vehicle_frames(self) -> IntArray:
         """Number of vehicle-frames at each spot, (k,) int64."""
         return np.bincount(self.spot[self.visit], minlength=len(self))
 
     @property
-    def vehicles(self) -> Ints:
+    def vehicles(self) -> IntArray:
         """Number of different vehicles at each spot, (k,) int64."""
         return np.bincount(self.spot, minlength=len(self))
 
     @cached_property
-    def _visit_weights(self) -> Floats:
+    def _visit_weights(self) -> FloatArray:
         return self._sum_by_visit(self.visit, self.weight[self.row])
 
     @cached_property
-    def weights(self) -> Floats:
+    def weights(self) -> FloatArray:
         """Weight of all vehicle-frames at each spot, (k,) float64."""
         return self._sum_by_spot(self._visit_weights)
 
-    def visibility(self, points: Floats, chances: Floats) -> SpotVisibility:
+    def visibility(self, points: FloatArray, chances: FloatArray) -> SpotVisibility:
         """Return what a site sees at each spot.
 
         Parameters
@@ -182,14 +175,14 @@ class VehicleSpots:
         counts = np.bincount(self.spot[with_points], minlength=len(self))
         return SpotVisibility(share, np.sqrt(squares * correction) / self.weights, counts)
 
-    def _sum_by_visit(self, visit: Ints, weight: Floats) -> Floats:
+    def _sum_by_visit(self, visit: IntArray, weight: FloatArray) -> FloatArray:
         return np.bincount(visit, weight, minlength=len(self.spot)).astype(np.float64)
 
-    def _sum_by_spot(self, values: Floats) -> Floats:
+    def _sum_by_spot(self, values: FloatArray) -> FloatArray:
         return np.bincount(self.spot, values, minlength=len(self)).astype(np.float64)
 
 
-def cells_of(boxes: Floats, roi: Roi) -> tuple[Ints, Ints]:
+def cells_of(boxes: FloatArray, roi: Roi) -> tuple[IntArray, IntArray]:
     """Return the cells of the region whose middle a box covers in plan, and the cell of the middle of the box.
 
     Parameters
@@ -225,18 +218,18 @@ class _Matches(NamedTuple):
     """Locations in order, and pairs of a vehicle-frame and the index of a location, (m,) int64 each."""
 
     locations: tuple[RoadLocation, ...]
-    row: Ints
-    spot: Ints
+    row: IntArray
+    spot: IntArray
 
 
-def _match_roads(boxes: Floats, roads: RoadLocations | None) -> _Matches:
+def _match_roads(boxes: FloatArray, roads: RoadLocations | None) -> _Matches:
     """Match vehicle-frames with the locations where they are."""
-    rows: list[tuple[RoadLocation, Ints]] = []
+    rows: list[tuple[RoadLocation, IntArray]] = []
     if len(boxes):
         rows.append((RoadLocation(ALL, "", "all vehicles", (0.0, 0.0)), np.arange(len(boxes))))
     if roads is not None:
         lane = match_lanes(fronts_m(boxes), boxes[:, 6], roads.lanes)
-        by_location: list[list[Ints]] = [[] for _ in roads.locations]
+        by_location: list[list[IntArray]] = [[] for _ in roads.locations]
         for number in np.unique(lane[lane >= 0]).tolist():
             for location in roads.locations_of_lane[number]:
                 by_location[location].append(np.flatnonzero(lane == number))
@@ -254,7 +247,7 @@ def _match_roads(boxes: Floats, roads: RoadLocations | None) -> _Matches:
     return _Matches(tuple(disambiguate([location for location, _ in rows])), row, spot)
 
 
-def _match_crossings(boxes: Floats, roads: RoadLocations) -> Iterator[tuple[int, Ints]]:
+def _match_crossings(boxes: FloatArray, roads: RoadLocations) -> Iterator[tuple[int, IntArray]]:
     """The boxes that reach each crossing."""
     import shapely
 

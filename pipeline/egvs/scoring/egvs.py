@@ -23,7 +23,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.kernels import traversal
 
-Hits = NDArray[np.uint32] | NDArray[np.int64]
+Hits = NDArray[np.uint32] | IntArray
 """Hits of each voxel, flat, (nx * ny * nz,): numbers of beams, or multiples of a fraction of a beam."""
 
 _DIGITS = 40

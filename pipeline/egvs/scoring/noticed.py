@@ -52,9 +52,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.scoring.targets import TargetRecord, TargetVisibility
 
 DATA_FILE = Path(__file__).with_name("noticed.json")
@@ -203,7 +202,7 @@ def road_user_groups() -> tuple[RoadUserGroup, ...]:
     return tuple(RoadUserGroup.of(name, entry, bins) for name, entry in document["curves"].items())
 
 
-def group_members(record: TargetRecord) -> dict[str, NDArray[np.bool_]]:
+def group_members(record: TargetRecord) -> dict[str, BoolArray]:
     """Return which rows of a record each group has, (n,) bool, by the name of the group."""
     members = {}
     for group in road_user_groups():
@@ -239,13 +238,12 @@ def noticed_pools() -> int:
     return sum(len(group.curve.pool_se) for group in road_user_groups())
 
 
-def are_outside_data(visible: TargetVisibility) -> NDArray[np.bool_]:
+def are_outside_data(visible: TargetVisibility) -> BoolArray:
     """Return which vehicle-frames are of a kind that was not measured, or farther than :data:`FARTHEST_M`, (n,)."""
     record = visible.record
     measured = frozenset[str]().union(*(group.measured for group in road_user_groups()))
     is_measured = np.array([kind in measured for kind in record.kinds], dtype=np.bool_)[record.kind]
-    outside: NDArray[np.bool_] = ~is_measured | (visible.range_m > FARTHEST_M)
-    return outside
+    return ~is_measured | (visible.range_m > FARTHEST_M)
 
 
 def noticed_bounds(visible: TargetVisibility) -> tuple[FloatArray, FloatArray]:

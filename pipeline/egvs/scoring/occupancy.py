@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from egvs.artefacts import parquet
 from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS, FrameBoxes
 from egvs.core.errors import Diagnostic
-from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.core.grid import BoolArray, FloatArray, Grid, IntArray
 from egvs.core.wording import format_percent
 from egvs.kernels import occupancy
 from egvs.scenario.model import SCENARIO_FILE
@@ -74,16 +74,16 @@ def count_blocks(batches: Iterator[FrameBoxes], grid: Grid, block_frames: int, b
         yield BlockCounts(np.ascontiguousarray(steps[:-1].transpose(1, 2, 0)), boxes_per_frame)
 
 
-def near_grid(values: FloatArray, grid: Grid) -> NDArray[np.bool_]:
+def near_grid(values: FloatArray, grid: Grid) -> BoolArray:
     """Return which boxes (n, 8), as ``FrameBoxes.values``, have a circumscribed ball that meets the grid."""
     radius = 0.5 * np.sqrt((values[:, 5:8] ** 2).sum(axis=1))
     centre = values[:, :3]
     size = np.asarray(grid.roi.size_m)
-    near: NDArray[np.bool_] = ((centre + radius[:, None] > 0) & (centre - radius[:, None] < size)).all(axis=1)
+    near: BoolArray = ((centre + radius[:, None] > 0) & (centre - radius[:, None] < size)).all(axis=1)
     return near
 
 
-def static_voxels(world: World, grid: Grid) -> NDArray[np.bool_]:
+def static_voxels(world: World, grid: Grid) -> BoolArray:
     """Return the voxels that static geometry fills, wholly or in part (deeper than 0.1 mm), (nx, ny, nz) bool."""
     shape = np.asarray(grid.shape, dtype=np.int64)
     triangles = grid.to_grid_m(world.triangles_m)

@@ -22,9 +22,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.core.grid import BoolArray, FloatArray, Grid, IntArray
 from egvs.effects.returns import ReturnProbability
 from egvs.scoring.blindspots import CELL_M, blindspot_map_shape
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord, visible_targets
@@ -77,7 +76,7 @@ class PointsMap:
     cell_m: float = CELL_M
 
     @property
-    def on_surface(self) -> NDArray[np.bool_]:
+    def on_surface(self) -> BoolArray:
         """Which squares are on the surface, (nx, ny)."""
         return np.logical_not(np.isnan(self.values))
 
@@ -119,7 +118,10 @@ class TargetPositions:
         """Find the positions of a target on the surface of a network, in the region of interest of a grid."""
         cells = [np.empty((0, 2), dtype=np.int64)]
         poses = [np.empty((0, 4))]
-        middles_m = _cell_middles_m(grid)
+        nx, ny = blindspot_map_shape(grid)
+        x_m = grid.origin_m[0] + (np.arange(nx) + 0.5) * CELL_M
+        y_m = grid.origin_m[1] + (np.arange(ny) + 0.5) * CELL_M
+        middles_m = np.stack(np.meshgrid(x_m, y_m, indexing="ij"), axis=-1)
         for area, height_and_yaw in _surfaces(target, network, grid):
             covered = _covered_cells(area, middles_m, grid)
             at_m = middles_m[covered[:, 0], covered[:, 1]]
@@ -155,27 +157,17 @@ class TargetPositions:
         return PointsMap(self.target, values, (self.grid.origin_m[0], self.grid.origin_m[1]))
 
 
-def overlap_map(maps: Sequence[PointsMap], points: float = OVERLAP_POINTS) -> PointsMap:
-    """Return by how many sensors each square gets at least a number of points.
+def overlap_map(maps: Sequence[PointsMap]) -> PointsMap:
+    """Return by how many sensors each square gets at least :data:`OVERLAP_POINTS`.
 
     Parameters
     ----------
     maps
         One map of each sensor, of the same target; at least one.
-    points
-        Number of points from which on a sensor counts.
     """
     first = maps[0]
-    counts = np.sum([points_map.values >= points for points_map in maps], axis=0).astype(np.float64)
+    counts = np.sum([points_map.values >= OVERLAP_POINTS for points_map in maps], axis=0).astype(np.float64)
     return PointsMap(first.target, np.where(first.on_surface, counts, np.nan), first.origin_m, first.cell_m)
-
-
-def _cell_middles_m(grid: Grid) -> FloatArray:
-    """Middle of each square, (nx, ny, 2)."""
-    nx, ny = blindspot_map_shape(grid)
-    x_m = grid.origin_m[0] + (np.arange(nx) + 0.5) * CELL_M
-    y_m = grid.origin_m[1] + (np.arange(ny) + 0.5) * CELL_M
-    return np.stack(np.meshgrid(x_m, y_m, indexing="ij"), axis=-1)
 
 
 def _covered_cells(area: Any, middles_m: FloatArray, grid: Grid) -> IntArray:

@@ -22,15 +22,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import Roi
+from egvs.core.grid import FloatArray, IntArray, Roi
 from egvs.traffic.approach_names import ApproachNames, approach_name
 from egvs.traffic.directions import TURNS, U_TURN, compass
 from egvs.traffic.network import LANE_WIDTH_M, Connection, Edge, Lane, Network, is_carriageway
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 SAME_WAY_RAD = np.pi / 3
 """A vehicle is not on a lane if its heading differs by more than this."""
@@ -42,21 +38,21 @@ _TIE_M = 1e-6
 class MiddleLine:
     """A lane as a strip: at least two points of its middle line, (n, 2), in the direction of travel, and its width."""
 
-    points_m: Floats
+    points_m: FloatArray
     width_m: float
 
 
-def fronts_m(boxes: Floats) -> Floats:
+def fronts_m(boxes: FloatArray) -> FloatArray:
     """Return the middle of the front of each box in plan, (n, 2).
 
     Boxes are as :data:`egvs.artefacts.traffic_frames.BOX_COLUMNS`, (n, 7).
     """
     forward = np.column_stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])])
-    fronts: Floats = boxes[:, :2] + boxes[:, 3:4] / 2.0 * forward
+    fronts: FloatArray = boxes[:, :2] + boxes[:, 3:4] / 2.0 * forward
     return fronts
 
 
-def match_lanes(fronts: Floats, yaw_rad: Floats, lanes: Sequence[MiddleLine]) -> Ints:
+def match_lanes(fronts: FloatArray, yaw_rad: FloatArray, lanes: Sequence[MiddleLine]) -> IntArray:
     """Return the lane that each vehicle drives on.
 
     Parameters
@@ -91,7 +87,7 @@ def match_lanes(fronts: Floats, yaw_rad: Floats, lanes: Sequence[MiddleLine]) ->
     return matched
 
 
-def _distance_and_turn(at_m: Floats, yaw_rad: Floats, line_m: Floats) -> tuple[Floats, Floats]:
+def _distance_and_turn(at_m: FloatArray, yaw_rad: FloatArray, line_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Distance of each point from a line with a length, and the angle between heading and nearest segment, (n,) each.
 
     At a bend with two equally near segments, the smaller angle.
@@ -105,7 +101,7 @@ def _distance_and_turn(at_m: Floats, yaw_rad: Floats, line_m: Floats) -> tuple[F
     heading = np.arctan2(along[:, 1], along[:, 0])
     turned = np.abs(np.angle(np.exp(1j * (yaw_rad[:, None] - heading))))
     turned[distances > nearest[:, None] + _TIE_M] = np.inf
-    smallest: Floats = turned.min(axis=1)
+    smallest: FloatArray = turned.min(axis=1)
     return nearest, smallest
 
 

@@ -350,8 +350,7 @@ def _binary_entropies(p: FloatArray) -> FloatArray:
     """Return H(p) in bits, float64."""
     inside = (p > 0.0) & (p < 1.0)
     q = np.where(inside, p, 0.5)
-    entropies: FloatArray = np.where(inside, -(q * np.log(q) + (1.0 - q) * np.log1p(-q)) / math.log(2.0), 0.0)
-    return entropies
+    return np.where(inside, -(q * np.log(q) + (1.0 - q) * np.log1p(-q)) / math.log(2.0), 0.0)
 
 
 def _exact_entropies(counts: IntArray, frames: int, grid: Grid) -> FloatArray:
@@ -493,8 +492,7 @@ class ScoreUncertainty:
     @cached_property
     def bias(self) -> FloatArray:
         """Expected error of ``scores`` due to the limited number of frames, (n,) float64."""
-        bias: FloatArray = sum((self.scores - stratum.centre for stratum in self.strata), np.zeros(len(self.scores)))
-        return bias
+        return sum((self.scores - stratum.centre for stratum in self.strata), np.zeros(len(self.scores)))
 
     @property
     def traffic_strata(self) -> tuple[Stratum, ...]:
@@ -548,8 +546,7 @@ class ScoreUncertainty:
 
     def detector_error(self, a: IntArray, b: IntArray) -> FloatArray:
         """Return the part of the errors of :meth:`differences` that is due to detectors, (m,) float64."""
-        error: FloatArray = np.sqrt(_sum_of_variances(self.detector_strata, a, b))
-        return error
+        return np.sqrt(_sum_of_variances(self.detector_strata, a, b))
 
     def beats(self, a: IntArray, b: IntArray) -> FloatArray:
         """Return the probability (m,) that sites a (m,) score higher in infinitely long traffic.
@@ -560,12 +557,10 @@ class ScoreUncertainty:
         with np.errstate(divide="ignore", invalid="ignore"):
             chance = stdtr(self._freedoms(a, b), gap / error)
         # Rounded to 1e-6, because the last bits of a t distribution depend on the machine.
-        rounded: FloatArray = np.round(np.where(gap == 0.0, 0.5, chance), 6).astype(np.float64)
-        return rounded
+        return np.round(np.where(gap == 0.0, 0.5, chance), 6).astype(np.float64)
 
     def _error(self, a: IntArray, b: IntArray | None = None) -> FloatArray:
-        error: FloatArray = np.sqrt(_sum_of_variances(self.strata, a, b))
-        return error
+        return np.sqrt(_sum_of_variances(self.strata, a, b))
 
     def _freedoms(self, a: IntArray, b: IntArray | None = None) -> FloatArray:
         """Degrees of freedom of the scores of sites a (m,), or of their lead over sites b (m,): Satterthwaite's."""

@@ -58,7 +58,7 @@ from typing import Any, get_args
 import numpy as np
 
 from egvs.core import plugins
-from egvs.core.errors import RunError
+from egvs.core.errors import InputError, RunError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
 from egvs.kernels.boosted_trees import add_tree_values
@@ -154,14 +154,12 @@ def group_score(score: str, group: str) -> str:
 
 def log_points(points: FloatArray) -> FloatArray:
     r"""Return :math:`g(n) = \ln(1 + n)`."""
-    gain: FloatArray = np.log1p(points)
-    return gain
+    return np.log1p(points)
 
 
 def saturating_gain(points: FloatArray) -> FloatArray:
     r"""Return :math:`g(n) = 1 - e^{-n / n_0}`, from 0 to 1, with :data:`SEEN_WELL_POINTS`."""
-    gain: FloatArray = -np.expm1(-points / SEEN_WELL_POINTS)
-    return gain
+    return -np.expm1(-points / SEEN_WELL_POINTS)
 
 
 def points_on_target(visible: TargetVisibility, gain: Gain = log_points, weight: FloatArray | None = None) -> float:
@@ -372,8 +370,7 @@ def expected_by_points(points: FloatArray) -> FloatArray:
     >>> expected_by_points(np.array([0.0, 19.0, 20.0, 300.0])).tolist()
     [0.0, 0.0, 1.0, 1.0]
     """
-    is_found: FloatArray = (points >= PEOPLE_POINTS).astype(np.float64)
-    return is_found
+    return (points >= PEOPLE_POINTS).astype(np.float64)
 
 
 def expected_by_detector(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:
@@ -451,15 +448,15 @@ def load_vehicle_score(name: str) -> VehicleScore:
     Raises
     ------
     InputError
-        When there is no such score.
+        When there is no such score, or it cannot rank sites.
     MissingBackendError
-        When it cannot be loaded, or can rank no sites.
+        When it cannot be loaded.
     """
     score = plugins.load_plugin(SCORES_GROUP, name)
     if not isinstance(score, VehicleScore):
-        expected = f"{VehicleScore.__module__}.{VehicleScore.__name__}"
-        problem = f"only a {expected} can rank sites, got a {type(score).__name__}"
-        raise plugins.plugin_error(SCORES_GROUP, name, problem)
+        problem = f"{name!r} is a {type(score).__name__}, which cannot rank sites"
+        hint = f"Use an {VehicleScore.__module__}.{VehicleScore.__name__}; egvs validate compares other scores."
+        raise InputError("score.rank_by", problem, hint)
     if score.name != name:
         problem = f"expected the name {name!r} of its entry point, got {score.name!r}"
         raise plugins.plugin_error(SCORES_GROUP, name, problem)

@@ -48,7 +48,7 @@ from egvs.artefacts.frame_boxes import NON_VEHICLE_KINDS
 from egvs.artefacts.tpog import PeriodBlocks, read_periods
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import Diagnostic
-from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.core.grid import BoolArray, FloatArray, Grid, IntArray
 from egvs.effects.returns import ReturnProbability, reflectivity_of
 from egvs.kernels import occlusion, vehicle_visibility
 from egvs.scenario.model import SCENARIO_FILE
@@ -59,7 +59,6 @@ from egvs.scoring.visibility import Beams
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
-Floats = FloatArray
 
 SEEN_WELL_POINTS = 20.0
 """n0: the gain of a vehicle with this many points is 63 %, with three times as many 95 %."""
@@ -102,7 +101,7 @@ class AllBoxes:
     values: FloatArray
     low: FloatArray
     high: FloatArray
-    are_vehicles: NDArray[np.bool_]
+    are_vehicles: BoolArray
     vehicle: IntArray
 
     @classmethod
@@ -188,7 +187,7 @@ class TargetRecord:
         return len(self.row)
 
     @property
-    def are_people(self) -> NDArray[np.bool_]:
+    def are_people(self) -> BoolArray:
         """Which rows are on foot or on a bicycle, (n,)."""
         return np.array([kind in NON_VEHICLE_KINDS for kind in self.kinds], dtype=np.bool_)[self.kind]
 
@@ -788,9 +787,9 @@ def warn_unused_weights(
             yield Diagnostic("weights", f"{SCENARIO_FILE}: score.weights.zones.{name}", problem, hint)
 
 
-def _in_area(area: BaseGeometry, record: TargetRecord) -> NDArray[np.bool_]:
+def _in_area(area: BaseGeometry, record: TargetRecord) -> BoolArray:
     """Return which vehicle-frames have their centre in an area or on its edge."""
     import shapely
 
-    inside: NDArray[np.bool_] = shapely.intersects_xy(area, record.boxes[:, 0], record.boxes[:, 1])
+    inside: BoolArray = shapely.intersects_xy(area, record.boxes[:, 0], record.boxes[:, 1])
     return inside

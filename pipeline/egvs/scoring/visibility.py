@@ -187,7 +187,10 @@ class HitCounter:
 
         probability = ReturnProbability.of(self._scene, beams.sensor)
         if probability is not None:
-            self._thin(hits, scale, probability, segments.origin, cells, weighted)
+            if cells is None:
+                cells = np.arange(len(weighted))
+            table = RangeTable.over(probability, segments.origin * self._grid.voxel_m, self._grid)
+            table.thin(hits, scale, segments.origin, self._grid, cells, weighted)
         elif hits is not weighted:
             np.multiply(hits, scale, out=weighted, dtype=np.int64)
         return weighted
@@ -238,21 +241,6 @@ class HitCounter:
         for piece in voxel_crossings.list_crossings(beams.pose.position_m, beams.ends_m, self._grid):
             shares = [checked_shares(effect, effect.share(piece), len(piece.cells), "crossings") for effect in effects]
             hit_kernels.add_shares(piece.first, piece.cells, weights[piece.rows], math.prod(shares), UNIT, hits)
-
-    def _thin(
-        self,
-        hits: Hits,
-        scale: int,
-        probability: ByRange,
-        origin: FloatArray,
-        cells: IntArray | None,
-        thinned: IntArray,
-    ) -> None:
-        """Fill ``thinned`` at ``cells`` with the detected part of ``hits`` times ``scale``."""
-        if cells is None:
-            cells = np.arange(len(thinned))
-        table = RangeTable.over(probability, origin * self._grid.voxel_m, self._grid)
-        table.thin(hits, scale, origin, self._grid, cells, thinned)
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,8 +87,7 @@ class GroundPlane:
 
     def distance_m(self, points_m: FloatArray) -> FloatArray:
         """Height of points (..., 3) above the plane."""
-        distance: FloatArray = points_m @ self.normal + self.height_m
-        return distance
+        return points_m @ self.normal + self.height_m
 
 
 def find_ground_planes(points_m: FloatArray, normals: FloatArray, where: str) -> list[GroundPlane]:
@@ -231,5 +230,4 @@ def _jackknife(members: FloatArray) -> FloatArray:
     if len(sectors) < 3:
         return np.full(3, np.nan)
     poses = np.array([_pose(_solve(sum(products) - p, sum(sides) - s)) for p, s in zip(products, sides, strict=True)])
-    errors: FloatArray = np.sqrt(jackknife_variance(poses))
-    return errors
+    return np.sqrt(jackknife_variance(poses))

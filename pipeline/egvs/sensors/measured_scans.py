@@ -25,16 +25,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.core.wording import format_percent, number_of
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose, Site
-
-Bools = NDArray[np.bool_]
 
 ON_SURFACE_M, ON_SURFACE_SHARE = 0.3, 0.01
 """A point that is no farther from a surface than this distance and this share of its range together is on it."""
@@ -350,14 +347,16 @@ def compare_with_world(worlds: Sequence[Scanner], reading: Reading) -> Agreement
     return Agreement(len(reading.ends_m), int((on_ground & ~on_structure).sum()), int(on_structure.sum()))
 
 
-def _compare_points(scanner: Scanner, pose: Pose, ends_m: FloatArray, range_m: FloatArray) -> tuple[Bools, Bools]:
+def _compare_points(
+    scanner: Scanner, pose: Pose, ends_m: FloatArray, range_m: FloatArray
+) -> tuple[BoolArray, BoolArray]:
     """Return whether points are on the surface that their beam meets, and whether that is the ground, (n,) each."""
     hits_m, normals, is_ground = _surfaces_met(scanner, pose, ends_m)
     off_m = np.abs(((hits_m - ends_m) * normals).sum(axis=1))
     return off_m <= ON_SURFACE_M + ON_SURFACE_SHARE * range_m, is_ground
 
 
-def _surfaces_met(scanner: Scanner, pose: Pose, ends_m: FloatArray) -> tuple[FloatArray, FloatArray, Bools]:
+def _surfaces_met(scanner: Scanner, pose: Pose, ends_m: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return where the beams through points meet a surface, its normal there, (n, 3), and whether it is the ground.
 
     Positions are relative to the sensor; positions and normals are NaN where a beam meets nothing.

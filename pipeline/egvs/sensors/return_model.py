@@ -231,8 +231,7 @@ class ReturnModel:
         rho = self.target_reflectivity() if reflectivity is None else reflectivity
         limit_m = self.limit_m(1.0) * np.sqrt(rho)
         if self.softness == 0:
-            within: FloatArray = (1.0 - self.dropout) * (range_m <= limit_m).astype(np.float64)
-            return within
+            return (1.0 - self.dropout) * (range_m <= limit_m).astype(np.float64)
         with np.errstate(divide="ignore", over="ignore"):  # the power is infinite at the sensor itself
             detected: FloatArray = ndtr(2.0 * np.log(limit_m / range_m) / self.softness)
         return (1.0 - self.dropout) * detected

@@ -154,8 +154,7 @@ def beams_from_pattern(pattern: BeamPatternConfig, find: Callable[[str], Path] =
 
 def _interpolate_deg(span_deg: tuple[float, float], share: FloatArray) -> FloatArray:
     low, high = span_deg
-    angles: FloatArray = np.round(low + (high - low) * share, _BEAM_DIGITS)
-    return angles
+    return np.round(low + (high - low) * share, _BEAM_DIGITS)
 
 
 _DEFAULTS = SensorConfig.model_fields

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from egvs.core import polylines
 from egvs.core.errors import Diagnostic, InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.core.wording import by_number, format_percent, list_first, number_of
 from egvs.scenario.model import TERRAIN_KEY
 from egvs.sensors.site_feasibility import ground_height_m
@@ -196,7 +196,7 @@ class _Extents:
 
     low_m: FloatArray
     high_m: FloatArray
-    is_solid: NDArray[np.bool_]
+    is_solid: BoolArray
 
     @classmethod
     def of(cls, world: World) -> _Extents:
@@ -207,14 +207,14 @@ class _Extents:
         is_ground = np.array([kind == "ground" for _, kind in world.solids], dtype=np.bool_)
         return cls(low_m, high_m, np.isfinite(low_m[:, 0]) & ~is_ground)
 
-    def boxes(self, solids: NDArray[np.int64]) -> NDArray[Any]:
+    def boxes(self, solids: IntArray) -> NDArray[Any]:
         """Return rectangles in plan."""
         import shapely
 
         boxes: NDArray[Any] = shapely.box(*self.low_m[solids, :2].T, *self.high_m[solids, :2].T)
         return boxes
 
-    def carried(self, solids: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def carried(self, solids: IntArray) -> BoolArray:
         """Return which solids stand on another one, or in it."""
         others = np.flatnonzero(self.is_solid)
         carried = np.zeros(len(solids), dtype=np.bool_)
@@ -275,17 +275,14 @@ def _check_source(
             yield _solid_diagnostic(source, reference, is_doubtful, total, offset_m, names, side, is_error=False)
 
 
-def _has_offset_of(is_off: NDArray[np.bool_], offset_m: FloatArray) -> NDArray[np.bool_]:
+def _has_offset_of(is_off: BoolArray, offset_m: FloatArray) -> BoolArray:
     """Return which solids have the same offset as those that no slope explains: a slope would depend on distance."""
     if not is_off.any():
         return is_off
-    is_same: NDArray[np.bool_] = np.abs(offset_m - np.median(offset_m[is_off])) <= MARGIN_M
-    return is_same
+    return np.abs(offset_m - np.median(offset_m[is_off])) <= MARGIN_M
 
 
-def _overhead_heights_m(
-    inputs: CheckInputs, extents: _Extents, solids: NDArray[np.int64], boxes: NDArray[Any]
-) -> FloatArray:
+def _overhead_heights_m(inputs: CheckInputs, extents: _Extents, solids: IntArray, boxes: NDArray[Any]) -> FloatArray:
     """Return how high solids may be above the road without a slope, as decks, roofs, signs or crowns; 0 for others."""
     assert inputs.world is not None
     thickness_m = extents.high_m[solids, 2] - extents.low_m[solids, 2]
@@ -304,7 +301,7 @@ def _ground_below_m(world: World, box: Any) -> float:
 def _solid_diagnostic(
     source: SolidSource,
     reference: Reference,
-    is_off: NDArray[np.bool_],
+    is_off: BoolArray,
     total: int,
     offset_m: FloatArray,
     names: list[str],

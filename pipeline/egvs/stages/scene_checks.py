@@ -17,7 +17,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Roi
@@ -495,7 +494,7 @@ def _reaches_region(inputs: CheckInputs, site: Site, sensor: Sensor) -> bool:
 
 
 @lru_cache(maxsize=_CACHED_MOUNTS)
-def _cached_directions(sensor: Sensor, angles_deg: tuple[float, float, float]) -> NDArray[np.float64]:
+def _cached_directions(sensor: Sensor, angles_deg: tuple[float, float, float]) -> FloatArray:
     return sensor.directions(*angles_deg)
 
 
@@ -623,7 +622,7 @@ def warn_solids_far_away(inputs: CheckInputs) -> Iterator[Diagnostic]:
 
 
 def _solids_in_the_way(
-    world: World, carriageway: Carriageway, low_m: NDArray[np.float64], high_m: NDArray[np.float64]
+    world: World, carriageway: Carriageway, low_m: FloatArray, high_m: FloatArray
 ) -> dict[int, list[object]]:
     """Solid -> its parts, in plan, that are in the way on some lane of a rectangle."""
     import shapely
@@ -648,7 +647,7 @@ def _solids_in_the_way(
     return {solid: list(of.values()) for solid, of in parts.items()}
 
 
-def _surroundings(box: Roi) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _surroundings(box: Roi) -> tuple[FloatArray, FloatArray]:
     low = np.asarray(box.origin_m[:2])
     return low - clearances.ROI_MARGIN_M, low + np.asarray(box.size_m[:2]) + clearances.ROI_MARGIN_M
 
@@ -659,5 +658,5 @@ def _describe_solid(world: World, common: object, solid: int) -> str:
     return f"{name} ({kind}) {common.area:.0f} m2 at {_format_position((spot.x, spot.y))}"  # type: ignore[attr-defined]
 
 
-def _format_position(xy_m: tuple[float, float] | NDArray[np.float64]) -> str:
+def _format_position(xy_m: tuple[float, float] | FloatArray) -> str:
     return f"({xy_m[0]:.0f}, {xy_m[1]:.0f})"

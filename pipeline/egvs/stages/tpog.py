@@ -26,7 +26,7 @@ from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY, BoxReader, FrameBoxes,
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import PeriodBlocks, frame_multiplicities
 from egvs.core.errors import WARNINGS_KEY, InputError
-from egvs.core.grid import Grid, IntArray
+from egvs.core.grid import BoolArray, Grid, IntArray
 from egvs.core.progress import ProgressCallback
 from egvs.core.threads import checkpoint, run_in_thread
 from egvs.scenario.model import Scenario
@@ -231,7 +231,7 @@ class _BlockWriter:
     solid: IntArray
     hidden: IntArray = field(init=False)
     visible: int = 0
-    occupied: NDArray[np.bool_] | bool = False
+    occupied: BoolArray | bool = False
 
     def __post_init__(self) -> None:
         self.hidden = np.zeros(len(self.solid), dtype=np.int64)

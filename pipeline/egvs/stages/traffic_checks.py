@@ -9,11 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from egvs.artefacts import tpog
 from egvs.core.errors import Diagnostic, InputError
-from egvs.core.grid import FloatArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, Roi
 from egvs.effects import registry
 from egvs.formats import xml
 from egvs.formats.georeference import Georeference
@@ -283,11 +282,11 @@ def _recorded_positions_m(scenario: Scenario, world: Georeference) -> FloatArray
     return np.concatenate(near)
 
 
-def _is_near_region(positions_m: FloatArray, box: Roi) -> NDArray[np.bool_]:
+def _is_near_region(positions_m: FloatArray, box: Roi) -> BoolArray:
     low_m = np.asarray(box.origin_m[:2]) - clearances.ROI_MARGIN_M
     high_m = np.add(box.origin_m, box.size_m)[:2] + clearances.ROI_MARGIN_M
     is_inside = (positions_m[:, :2] >= low_m) & (positions_m[:, :2] <= high_m)
-    is_near: NDArray[np.bool_] = np.all(is_inside, axis=1)
+    is_near: BoolArray = np.all(is_inside, axis=1)
     return is_near
 
 

@@ -198,5 +198,4 @@ def estimate_scale(residual: FloatArray, variance_factor: float, step: float = 0
 def _block_sums(values: FloatArray) -> FloatArray:
     """Return the sums of consecutive rows in :data:`BLOCKS` blocks, (blocks, columns)."""
     starts = np.linspace(0, len(values), min(BLOCKS, len(values)), endpoint=False).astype(np.int64)
-    sums: FloatArray = np.add.reduceat(values.astype(np.float64), starts, axis=0)
-    return sums
+    return np.add.reduceat(values.astype(np.float64), starts, axis=0)

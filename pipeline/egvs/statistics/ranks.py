@@ -21,14 +21,14 @@ EQUALITY_TOLERANCE = 1e-12
 """Values are equal if they differ by less than this share of the largest."""
 
 
-def relative_errors(scores: NDArray[np.float64], reference: NDArray[np.float64]) -> NDArray[np.float64]:
+def relative_errors(scores: FloatArray, reference: FloatArray) -> FloatArray:
     """Return abs(score / reference - 1) of each site; infinite if only the reference is 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        change: NDArray[np.float64] = np.where(scores == reference, 0.0, np.abs(scores / reference - 1.0))
+        change: FloatArray = np.where(scores == reference, 0.0, np.abs(scores / reference - 1.0))
     return change
 
 
-def rank_agreement(scores: NDArray[np.float64], reference: NDArray[np.float64], kind: Literal["tau", "rho"]) -> float:
+def rank_agreement(scores: FloatArray, reference: FloatArray, kind: Literal["tau", "rho"]) -> float:
     """Return the correlation of two rankings.
 
     Parameters
@@ -53,7 +53,7 @@ def rank_agreement(scores: NDArray[np.float64], reference: NDArray[np.float64], 
     return float(spearmanr(scores, reference).statistic)
 
 
-def best_sites(scores: NDArray[np.float64], count: int) -> set[int]:
+def best_sites(scores: FloatArray, count: int) -> set[int]:
     """Return the indices of the ``count`` best sites, and of all that tie with the last of them."""
     if not len(scores):
         return set()
@@ -61,7 +61,7 @@ def best_sites(scores: NDArray[np.float64], count: int) -> set[int]:
     return set(np.flatnonzero(scores >= last).tolist())
 
 
-def regret(scores: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
+def regret(scores: FloatArray, reference: FloatArray) -> float:
     """Return the share of the best reference score that is lost at the best site by ``scores`` (the worst if several).
 
     Parameters

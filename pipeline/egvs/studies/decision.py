@@ -288,5 +288,4 @@ def _unit_noise(values: FloatArray, *, heavy_tails: bool) -> FloatArray:
 
 def _by_pole(shares: FloatArray, poles: IntArray) -> FloatArray:
     """Return shares of mounts (n,) summed over the mounts of each pole, (poles,)."""
-    by_pole: FloatArray = np.bincount(poles, weights=shares).astype(np.float64)
-    return by_pole
+    return np.bincount(poles, weights=shares).astype(np.float64)

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core import files
+from egvs.core.grid import FloatArray
 from egvs.results.studies import SCENARIO, SettingResult, Tolerance
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class LabelPlacement:
         Markers in data coordinates, (n, 2).
     """
 
-    def __init__(self, axes: Any, points: NDArray[np.float64]) -> None:
+    def __init__(self, axes: Any, points: FloatArray) -> None:
         self._axes, self._renderer = axes, axes.figure.canvas.get_renderer()
         self._occupied = [text.get_window_extent(self._renderer) for text in axes.texts]
         self._markers = axes.transData.transform(points)
@@ -115,8 +115,14 @@ def draw_figure(settings: Sequence[SettingResult], tolerance: Tolerance, title: 
     axes.set_title(f"What a right decision costs: {title}", fontsize=12)
     _scale_axes(axes, settings, tolerance)
     if tolerance.score is None:
-        _draw_tolerance(axes, tolerance)
-        _draw_front(axes, settings)
+        axes.axhline(tolerance.loss_points, color="0.4", linewidth=1, linestyle="--")
+        axes.annotate(
+            f"tolerance: {tolerance.loss_points:g}", (0.01, tolerance.loss_points), xycoords=("axes fraction", "data"),
+            xytext=(0, 3), textcoords="offset points", fontsize=8, color="0.25",
+        )  # fmt: skip
+        # the settings that no other beats in both time and loss
+        front = sorted((setting for setting in settings if setting.front), key=lambda setting: setting.seconds)
+        axes.step(*_coordinates(front), where="post", color="0.55", linewidth=1.2, zorder=1)
     _draw_settings(axes, settings)
     # below the panel, because a setting may be in any corner inside
     below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.11), "ncols": 5}
@@ -143,20 +149,6 @@ def _scale_axes(axes: Any, settings: Sequence[SettingResult], tolerance: Toleran
     axes.set_ylim(-0.06 * top, top)
     axes.grid(True, which="major", color="0.9", linewidth=0.7)
     axes.tick_params(labelsize=8)
-
-
-def _draw_tolerance(axes: Any, tolerance: Tolerance) -> None:
-    axes.axhline(tolerance.loss_points, color="0.4", linewidth=1, linestyle="--")
-    axes.annotate(
-        f"tolerance: {tolerance.loss_points:g}", (0.01, tolerance.loss_points), xycoords=("axes fraction", "data"),
-        xytext=(0, 3), textcoords="offset points", fontsize=8, color="0.25",
-    )  # fmt: skip
-
-
-def _draw_front(axes: Any, settings: Sequence[SettingResult]) -> None:
-    """Draw the settings that no other beats in both time and loss as a step line."""
-    front = sorted((setting for setting in settings if setting.front), key=lambda setting: setting.seconds)
-    axes.step(*_coordinates(front), where="post", color="0.55", linewidth=1.2, zorder=1)
 
 
 def _draw_settings(axes: Any, settings: Sequence[SettingResult]) -> None:

@@ -28,6 +28,4 @@ def write_if_changed(path: Path, document: Mapping[str, Any]) -> None:
     text = json.dumps(document, ensure_ascii=False, separators=(",", ":")) + "\n"
     if path.is_file() and path.read_text(encoding="utf-8") == text:
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with files.atomic_write(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    files.write_text(path, text)

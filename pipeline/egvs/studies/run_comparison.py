@@ -260,7 +260,9 @@ def compare_runs(
     runs = tuple(_read_run(Path(folder), run_label(number), costs) for number, folder in enumerate(folders))
     if not runs:
         raise InputError("compare", "expected at least one run, got none", "Give folders of finished runs.")
-    _check_priced_sensors(runs, costs)
+    compared = dict.fromkeys(sensor for run in runs for sensor in run.sensors)
+    priced = costs_from_dict({}, costs, "--set").sensor
+    check_sensor_names(priced, compared, "--set: costs.sensor")
     is_single = len(runs) == 1
     if is_single:
         runs = _split_by_sensor(runs[0], by)
@@ -334,7 +336,8 @@ def _read_run(folder: Path, label: str, cost_overrides: Sequence[str]) -> Compar
     metadata = parquet.read_metadata(path, "scores")
 
     compared = {key: value for key, value in record.scenario.items() if key not in _IGNORED_SETTINGS}
-    compared["placement"] = _without_request(compared.get("placement", {}))
+    placement = compared.get("placement", {})
+    compared["placement"] = {key: value for key, value in placement.items() if f"placement.{key}" not in PLAN_REQUEST}
     settings = {**flatten_settings(compared), "egvs (version)": record.egvs}
     if settings.get("score.gamma") == "auto":
         settings["score.gamma"] = metadata["gamma"]
@@ -356,18 +359,6 @@ def _unrated_sensors(scenario: Mapping[str, Any], names: Collection[str]) -> tup
     """Return the user-defined sensors of a recorded scenario that have no rated range."""
     custom = scenario.get("sensors", {})
     return tuple(sorted(name for name in names if name in custom and custom[name].get("rated_range_m") is None))
-
-
-def _without_request(placement: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a plan without those that ``egvs place`` replaces by its options."""
-    return {key: value for key, value in placement.items() if f"placement.{key}" not in PLAN_REQUEST}
-
-
-def _check_priced_sensors(runs: Sequence[ComparedRun], cost_overrides: Sequence[str]) -> None:
-    """InputError if an override is the cost of an unknown sensor."""
-    compared = dict.fromkeys(sensor for run in runs for sensor in run.sensors)
-    priced = costs_from_dict({}, cost_overrides, "--set").sensor
-    check_sensor_names(priced, compared, "--set: costs.sensor")
 
 
 def _split_by_sensor(run: ComparedRun, by: View | None) -> tuple[ComparedRun, ...]:

@@ -178,11 +178,13 @@ def score_run(
     n_frames = len(targets.record.numbers)
     scorer = None
     if rank_by not in TARGET_SCORES:
-        scorer = _window_scorer(work, windows, periods)
+        grid = work.scenario.roi.grid
+        tpogs = _window_tpogs(work.folder.tpog, grid, windows, periods)
+        parts = tuple(PeriodTpog(str(number), tpog) for number, tpog in enumerate(tpogs))
+        scorer = Scorer(work.scene, read_tpog(work.folder.tpog), work.folder.trajectories, None, parts)
 
     def by_frame(values: FloatArray) -> FloatArray:
-        sums: FloatArray = np.bincount(frame, values, n_frames).astype(np.float64)
-        return sums
+        return np.bincount(frame, values, n_frames).astype(np.float64)
 
     def score_site(scan: SiteScan) -> _SiteSums:
         visible = targets.visible(scan.beams)
@@ -234,14 +236,6 @@ def _frame_blocks(numbers: IntArray, recorded: Sequence[int], periods: Sequence[
     blocks = np.array([record.blocks for record in periods])
     block: IntArray = np.minimum((numbers - starts[period]) // block_frames[period], blocks[period] - 1)
     return block
-
-
-def _window_scorer(context: StageContext, windows: Sequence[Window], periods: Sequence[PeriodBlocks]) -> Scorer:
-    """Return a scorer whose periods are the windows."""
-    grid = context.scenario.roi.grid
-    tpogs = _window_tpogs(context.folder.tpog, grid, windows, periods)
-    parts = tuple(PeriodTpog(str(number), tpog) for number, tpog in enumerate(tpogs))
-    return Scorer(context.scene, read_tpog(context.folder.tpog), context.folder.trajectories, None, parts)
 
 
 def _window_tpogs(path: Path, grid: Grid, windows: Sequence[Window], periods: Sequence[PeriodBlocks]) -> list[Tpog]:

@@ -664,8 +664,7 @@ def _uncertainty(
 
 
 def _rows(result: SiteReplicates, names: Sequence[str]) -> FloatArray:
-    rows: FloatArray = result.values[[result.names.index(name) for name in names]]
-    return rows
+    return result.values[[result.names.index(name) for name in names]]
 
 
 def _site_scores(

@@ -22,7 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from egvs.core import polylines
-from egvs.traffic.directions import Floats, arrival_side, compass
+from egvs.core.grid import FloatArray
+from egvs.traffic.directions import arrival_side, compass
 from egvs.traffic.network import TURNAROUNDS, Edge, Network
 
 INSIDE = "inside"
@@ -92,22 +93,22 @@ class ApproachNames:
         self._previous = {edge: min(others) for edge, others in before.items() if len(others) == 1}
         self._next = {edge: min(others) for edge, others in after.items() if len(others) == 1}
 
-    def heading(self, edge_id: str) -> Floats:
+    def heading(self, edge_id: str) -> FloatArray:
         """Return the direction (2,) in which vehicles arrive at the end of an edge, not normalised."""
-        line_m = self._line_back(edge_id)
+        line_m = _joined(self._edges, edge_id, self._previous, backwards=True)
         edge = self._edges[edge_id]
         middle_m = self._ring_middle_m(edge.to_node, edge.from_node)
         junction_m = line_m[0] if middle_m is None else middle_m
-        heading: Floats = junction_m - polylines.points_at(line_m, HEADING_OVER_M)[0]
+        heading: FloatArray = junction_m - polylines.points_at(line_m, HEADING_OVER_M)[0]
         return heading
 
-    def exit_heading(self, edge_id: str) -> Floats:
+    def exit_heading(self, edge_id: str) -> FloatArray:
         """Return the direction (2,) in which vehicles leave a junction on an edge, not normalised."""
-        line_m = self._line_ahead(edge_id)
+        line_m = _joined(self._edges, edge_id, self._next, backwards=False)
         edge = self._edges[edge_id]
         middle_m = self._ring_middle_m(edge.from_node, edge.to_node)
         junction_m = line_m[0] if middle_m is None else middle_m
-        heading: Floats = polylines.points_at(line_m, HEADING_OVER_M)[0] - junction_m
+        heading: FloatArray = polylines.points_at(line_m, HEADING_OVER_M)[0] - junction_m
         return heading
 
     def side(self, edge_id: str) -> str:
@@ -169,25 +170,17 @@ class ApproachNames:
         """Return the name of a crossing, e.g. ``"North Street (north) crosswalk"``."""
         return f"{self.crossed_arm(crossing_id).name} crosswalk"
 
-    def _line_back(self, edge_id: str) -> Floats:
-        """Return a line from the end of an edge backwards, (n, 2), over :data:`HEADING_OVER_M`."""
-        return _joined(self._edges, edge_id, self._previous, backwards=True)
-
-    def _line_ahead(self, edge_id: str) -> Floats:
-        """Return a line from the start of an edge onwards, (n, 2)."""
-        return _joined(self._edges, edge_id, self._next, backwards=False)
-
-    def _ring_middle_m(self, node: str, other_node: str) -> Floats | None:
+    def _ring_middle_m(self, node: str, other_node: str) -> FloatArray | None:
         """Return the middle of the roundabout at a node (2,), for an edge that is not a part of its ring."""
         for ring in self._rings:
             if node in ring and other_node not in ring:
-                middle_m: Floats = np.mean([self._nodes_m[each] for each in sorted(ring)], axis=0)
+                middle_m: FloatArray = np.mean([self._nodes_m[each] for each in sorted(ring)], axis=0)
                 return middle_m
         return None
 
 
-def _joined(edges: dict[str, Edge], edge_id: str, following: dict[str, str], *, backwards: bool) -> Floats:
-    parts: list[Floats] = []
+def _joined(edges: dict[str, Edge], edge_id: str, following: dict[str, str], *, backwards: bool) -> FloatArray:
+    parts: list[FloatArray] = []
     length_m = 0.0
     visited: set[str] = set()
     next_id: str | None = edge_id
@@ -200,7 +193,7 @@ def _joined(edges: dict[str, Edge], edge_id: str, following: dict[str, str], *, 
     return np.vstack(parts)
 
 
-def _middle_line(edge: Edge) -> Floats:
+def _middle_line(edge: Edge) -> FloatArray:
     """Return the first lane for vehicles of an edge in plan, or its first lane if it has none, (n, 2)."""
     lane = next((lane for lane in edge.lanes if not lane.is_pavement and len(lane.shape_m) > 1), edge.lanes[0])
     return lane.shape_m[:, :2]

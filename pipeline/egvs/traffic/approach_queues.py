@@ -21,9 +21,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core import polylines
+from egvs.core.grid import FloatArray, IntArray
 from egvs.traffic.approaches import ApproachMovement
 from egvs.traffic.network import LANE_WIDTH_M, Edge, Network
 
@@ -37,9 +37,6 @@ MAX_QUEUE_M = 400.0
 _SIGNAL_TYPES = frozenset({"traffic_light", "traffic_light_unregulated", "traffic_light_right_on_red"})
 _MIN_COSINE = 0.7
 """Vehicles whose heading differs by more than 45 degrees from the path are on other roads."""
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -57,7 +54,7 @@ class ApproachPath:
     """
 
     title: str
-    line_m: Floats
+    line_m: FloatArray
     half_width_m: float
 
 
@@ -77,11 +74,11 @@ class VehicleFrames:
         Time between two frames.
     """
 
-    frame: Integers
-    vehicle: Integers
-    at_m: Floats
-    yaw_rad: Floats
-    length_m: Floats
+    frame: IntArray
+    vehicle: IntArray
+    at_m: FloatArray
+    yaw_rad: FloatArray
+    length_m: FloatArray
     period_s: float
 
     def between(self, first: int, end: int) -> VehicleFrames:
@@ -92,7 +89,7 @@ class VehicleFrames:
             self.period_s,
         )  # fmt: skip
 
-    def speeds_m_s(self) -> Floats:
+    def speeds_m_s(self) -> FloatArray:
         """Return the speed from each frame to the vehicle's next one, or from the former one at its end; shape (n,).
 
         NaN for vehicles that are in single frames only.
@@ -166,10 +163,9 @@ def _make_path(title: str, edges: list[Edge], before: Mapping[str, Edge], signal
     return ApproachPath(title, np.vstack(parts), (widest / 2 + 0.5) * width_m)
 
 
-def _middle_lane(edge: Edge) -> Floats:
+def _middle_lane(edge: Edge) -> FloatArray:
     """Return the lane in the middle of an edge from its end to its start, shape (n, 2)."""
-    line: Floats = edge.lanes[len(edge.lanes) // 2].shape_m[::-1, :2]
-    return line
+    return edge.lanes[len(edge.lanes) // 2].shape_m[::-1, :2]
 
 
 def _straight_predecessors(network: Network) -> dict[str, Edge]:
@@ -221,7 +217,7 @@ def measure_approach(path: ApproachPath, boxes: VehicleFrames, first: int, end: 
     )
 
 
-def queue_lengths_m(frame: Integers, distance_m: Floats, half_m: Floats, frames: int) -> Floats:
+def queue_lengths_m(frame: IntArray, distance_m: FloatArray, half_m: FloatArray, frames: int) -> FloatArray:
     """Return the length of the queue in each frame, shape (frames,).
 
     Parameters

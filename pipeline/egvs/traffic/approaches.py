@@ -15,9 +15,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_names import approach_name
-from egvs.traffic.directions import CLOCKWISE, COMPASS, U_TURN, Floats, arrival_side
+from egvs.traffic.directions import CLOCKWISE, COMPASS, U_TURN, arrival_side
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import Edge
 
@@ -151,7 +152,7 @@ class ApproachMovement:
     street: str
     turn: str
     edges: tuple[Edge, ...]
-    heading: Floats
+    heading: FloatArray
     aliases: tuple[str, ...] = ()
 
     @property

@@ -16,8 +16,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from egvs.core.grid import FloatArray
 from egvs.scenario.signal_config import DEFAULT_MIN_GREEN_S, SignalConfig, SignalPhaseConfig
-from egvs.traffic.directions import Floats
 from egvs.traffic.signal_plans import agree, make_program
 from egvs.traffic.signals import CROSSING, Link, Signal
 
@@ -115,7 +115,7 @@ class _Movements:
         headings = [self._heading(name) for name in (approach, other)]
         return float(headings[0] @ headings[1] / np.prod(np.linalg.norm(headings, axis=1)))
 
-    def _heading(self, approach: str) -> Floats:
+    def _heading(self, approach: str) -> FloatArray:
         links = (link for (name, _), links in self.links.items() if name == approach for link in links)
         return next(link.heading for link in links if link.heading is not None)
 

@@ -47,11 +47,10 @@ from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.formats import xml
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig, VehicleKind
 from egvs.traffic import sumo
@@ -337,7 +336,7 @@ def _reachable_pairs(
     return np.column_stack([sources[source], sinks[sink]]).astype(np.int64)
 
 
-def _reached_edges(links: IntArray, sources: IntArray, n_edges: int) -> NDArray[np.bool_]:
+def _reached_edges(links: IntArray, sources: IntArray, n_edges: int) -> BoolArray:
     """Return which edges can be reached from each source, (n_sources, n_edges).
 
     Loading a graph library would take longer than this search, and SUMO waits for it.
@@ -762,8 +761,7 @@ def _draw_ends(ends: Sequence[int], weights: FloatArray, rng: np.random.Generato
     share = weights[ends]
     if not share.any():
         share = np.ones(len(ends))
-    drawn: IntArray = np.asarray(ends)[np.searchsorted(np.cumsum(share) / share.sum(), rng.random(_MAX_DRAWS))]
-    return drawn
+    return np.asarray(ends)[np.searchsorted(np.cumsum(share) / share.sum(), rng.random(_MAX_DRAWS))]
 
 
 def _follow(towards: IntArray, start: int, end: int) -> list[int]:

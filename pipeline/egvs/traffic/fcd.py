@@ -24,11 +24,11 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from egvs.core import limits, reading
 from egvs.core.digests import open_input
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray, IntArray
 from egvs.core.wording import number_of
 from egvs.formats import arrow_bounds, xml
 from egvs.formats.georeference import WGS84, WORLD, CoordinateReading, Georeference, look_like_degrees
@@ -123,19 +123,17 @@ def has_heights(path: Path) -> bool:
     InputError
         As :func:`read_fcd` for the head of the file.
     """
-    with closing(_source_batches(path, "vehicle")[0]) as batches:
+    with closing(_source_batches(path)[0]) as batches:
         return any("z" in batch.schema.names for batch in itertools.islice(batches, 1))
 
 
-def read_fcd(path: Path, element: str = "vehicle") -> Iterator[pa.Table]:
-    """Read a file.
+def read_fcd(path: Path) -> Iterator[pa.Table]:
+    """Read the vehicles of a file.
 
     Parameters
     ----------
     path
         The file.
-    element
-        ``"vehicle"``, or ``"person"`` for a file of ``--person-fcd-output``; slopes of persons are set to 0.
 
     Yields
     ------
@@ -148,7 +146,7 @@ def read_fcd(path: Path, element: str = "vehicle") -> Iterator[pa.Table]:
         Names the file and the row if a column is missing, a value is not a number, times are not in order, or the file
         is damaged.
     """
-    yield from _checked_tables(*_source_batches(path, element))
+    yield from _checked_tables(*_source_batches(path))
 
 
 def read_growing_fcd(path: Path, element: str, has_ended: Callable[[], bool]) -> Iterator[pa.Table]:
@@ -159,7 +157,7 @@ def read_growing_fcd(path: Path, element: str, has_ended: Callable[[], bool]) ->
     path
         The file; it need not exist yet.
     element
-        As for :func:`read_fcd`.
+        ``"vehicle"``, or ``"person"`` for a file of ``--person-fcd-output``; slopes of persons are set to 0.
     has_ended
         Whether nothing will be added. An error that it raises ends the reading, before the last lines are read.
 
@@ -171,7 +169,7 @@ def read_growing_fcd(path: Path, element: str, has_ended: Callable[[], bool]) ->
     yield from _checked_tables(_read_growing_csv(path, element, has_ended), path, "row")
 
 
-def _source_batches(path: Path, element: str) -> tuple[Generator[pa.RecordBatch, None, None], Path, str]:
+def _source_batches(path: Path) -> tuple[Generator[pa.RecordBatch, None, None], Path, str]:
     """Return the batches of a file with the columns that are used, the file, and what it calls a row."""
     if not path.is_file():
         raise InputError(path, "no such file", "Use a file that SUMO wrote with --fcd-output.")
@@ -180,12 +178,12 @@ def _source_batches(path: Path, element: str) -> tuple[Generator[pa.RecordBatch,
     if not head:
         raise InputError(path, "is empty", EXPECTED_FCD)
     if head.startswith(b"<"):
-        return _read_xml(path, element), path, f"{element} element"
+        return _read_xml(path), path, "vehicle element"
     read = _read_parquet if head.startswith(b"PAR1") else _read_csv
-    return read(path, element), path, "row"
+    return read(path), path, "row"
 
 
-def _read_csv(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:
+def _read_csv(path: Path) -> Generator[pa.RecordBatch, None, None]:
     from pyarrow import csv
 
     with (
@@ -193,7 +191,7 @@ def _read_csv(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]
         xml.open_bounded(path) as file,
     ):
         header = xml.read_line(file, path)
-    layout = _CsvLayout.of(header, path, element)
+    layout = _CsvLayout.of(header, path, "vehicle")
     options = csv.ReadOptions(block_size=_BLOCK_BYTES, use_threads=False)
     with (
         reading.translate_errors(path, _COMPLETE_FILE, "cannot be read as CSV"),
@@ -266,12 +264,12 @@ class _CsvLayout(NamedTuple):
         return cls(list(columns), csv.ParseOptions(delimiter=delimiter), convert)
 
 
-def _read_parquet(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:
+def _read_parquet(path: Path) -> Generator[pa.RecordBatch, None, None]:
     import pyarrow.parquet as pq
 
     with _translate_parquet_errors(path), _open_seekable(path) as source:
         with pq.ParquetFile(source) as file:
-            columns = _source_columns(file.schema_arrow.names, path, element)
+            columns = _source_columns(file.schema_arrow.names, path, "vehicle")
             _check_rows(file.metadata.num_rows, source, path)
             largest = max(arrow_bounds.parquet_group_bytes(file, source, list(columns.values()), path), default=0)
             problem = f"has a row group of {largest / limits.MB:,.0f} MB after decompression"
@@ -324,16 +322,13 @@ def _check_rows(rows: int, source: Path | IO[bytes], path: Path) -> None:
         raise InputError(path, f"declares {rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)
 
 
-def _read_xml(path: Path, element: str) -> Generator[pa.RecordBatch, None, None]:
+def _read_xml(path: Path) -> Generator[pa.RecordBatch, None, None]:
     rows: list[dict[str, str]] = []
     steps = _StepCheck(path)
     for step in xml.iter_elements(path, "fcd-export"):
         steps.add(step.get("time", ""))
-        for child in step.iter(element):
-            row = {**child.attrib, "time": step.get("time", "")}
-            if element == "person":
-                row.pop("slope", None)
-            rows.append(row)
+        for vehicle in step.iter("vehicle"):
+            rows.append({**vehicle.attrib, "time": step.get("time", "")})
         if len(rows) >= _BATCH_ROWS:
             yield _xml_batch(rows, path)
             rows.clear()
@@ -469,7 +464,7 @@ class _RowBatch:
                 hint += " Times are seconds; subtract the start of the recording from dates."
             raise self._error(i, problem, hint)
 
-    def milliseconds(self) -> NDArray[np.int64]:
+    def milliseconds(self) -> IntArray:
         exact = _floats(self.columns["time"]) * 1000.0
         rounded = np.rint(exact)
         for i in np.flatnonzero(np.abs(exact - rounded) > 1e-3):
@@ -477,7 +472,7 @@ class _RowBatch:
             raise self._error(i, problem, "Round the times; SUMO counts in milliseconds.")
         return rounded.astype(np.int64)
 
-    def check_order(self, time_ms: NDArray[np.int64], last_ms: int) -> None:
+    def check_order(self, time_ms: IntArray, last_ms: int) -> None:
         before = np.concatenate([[last_ms], time_ms[:-1]])
         for i in np.flatnonzero(time_ms < before):
             problem = f"time {time_ms[i] / 1000:g} s comes after {before[i] / 1000:g} s"
@@ -490,7 +485,7 @@ class _RowBatch:
         return InputError(f"{self._where} {self._row[i]}", problem, hint)
 
 
-def _to_table(columns: dict[str, Any], time_ms: NDArray[np.int64]) -> pa.Table:
+def _to_table(columns: dict[str, Any], time_ms: IntArray) -> pa.Table:
     import pyarrow.compute as pc
 
     columns = columns | {"time_ms": pa.array(time_ms)}
@@ -500,15 +495,15 @@ def _to_table(columns: dict[str, Any], time_ms: NDArray[np.int64]) -> pa.Table:
     return pa.table([pc.cast(columns[f.name], f.type) for f in FCD_SCHEMA], schema=FCD_SCHEMA)
 
 
-def _floats(column: Any) -> NDArray[np.float64]:
+def _floats(column: Any) -> FloatArray:
     """Convert to float64; nulls become NaN."""
     import pyarrow.compute as pc
 
-    array: NDArray[np.float64] = pc.cast(column, pa.float64()).to_numpy(zero_copy_only=False)
+    array: FloatArray = pc.cast(column, pa.float64()).to_numpy(zero_copy_only=False)
     return array
 
 
-def _true_positions(mask: Any) -> NDArray[np.int64]:
+def _true_positions(mask: Any) -> IntArray:
     return np.flatnonzero(mask.to_numpy(zero_copy_only=False))
 
 
@@ -541,7 +536,7 @@ class FrameGroup:
 
     first_frame: int
     frames: int
-    frame: NDArray[np.int64]
+    frame: IntArray
     rows: pa.Table
 
 
@@ -574,7 +569,7 @@ class _FrameBuffer:
     step_ms: int = 0
     time_steps: int = 0
     start: int = 0
-    frames: list[NDArray[np.int64]] = field(default_factory=list)
+    frames: list[IntArray] = field(default_factory=list)
     tables: list[pa.Table] = field(default_factory=list)
 
     def add(self, table: pa.Table) -> int:

@@ -16,10 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_names import ApproachNames, plain_text
 from egvs.traffic.demand import RouteFinder
-from egvs.traffic.directions import TURNS, U_TURN, Floats
+from egvs.traffic.directions import TURNS, U_TURN
 from egvs.traffic.network import CAR, Edge, Network
 
 _WAYS = {"straight": "straight on", "left": "left", "right": "right", U_TURN: U_TURN}
@@ -58,7 +59,7 @@ class Movement(NamedTuple):
 
     approach: tuple[Edge, ...]
     street: str
-    heading: Floats
+    heading: FloatArray
     turn: str
     aliases: tuple[str, ...] = ()
     way_out: str = ""
@@ -190,7 +191,7 @@ def _street(edge: Edge) -> str:
     return plain_text(edge.name) or _UNNAMED_STREET
 
 
-def _turn_between(before: Floats, after: Floats) -> str:
+def _turn_between(before: FloatArray, after: FloatArray) -> str:
     """Return a value of :data:`TURNS` from two directions, (2,) each."""
     cross = before[0] * after[1] - before[1] * after[0]
     turned_deg = float(np.degrees(np.arctan2(cross, before @ after)))

@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core import polylines
 from egvs.core.digests import hash_input
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray, IntArray
 from egvs.core.polygons import PairCount, check_corners, check_edge_pairs
 from egvs.formats import osm, xml
 from egvs.scenario.fields import parse_coordinate_m
@@ -104,7 +104,7 @@ class Shape:
     pairs: PairCount = field(default_factory=PairCount, compare=False, repr=False, kw_only=True)
 
     @cached_property
-    def shape_m(self) -> NDArray[np.float64]:
+    def shape_m(self) -> FloatArray:
         """Points in metres, shape (n, 3), float64; z is 0 where the file has none."""
         try:
             points = [[*map(parse_coordinate_m, point.split(",")), 0.0][:3] for point in self.text.split()]
@@ -118,7 +118,7 @@ class Shape:
             self._check_edges(shape_m)
         return shape_m
 
-    def _check_edges(self, shape_m: NDArray[np.float64]) -> None:
+    def _check_edges(self, shape_m: FloatArray) -> None:
         """Raise an InputError when it would take long to repair the outline."""
         import shapely
 
@@ -151,7 +151,7 @@ class Lane(Shape):
         """Whether pedestrians may use it, and cars may not."""
         return self.permission.admits(_PEDESTRIAN) and not self.permission.admits(CAR)
 
-    def _check_edges(self, shape_m: NDArray[np.float64]) -> None:
+    def _check_edges(self, shape_m: FloatArray) -> None:
         """Raise an InputError when it would take long to widen the line, or to repair the outline."""
         import shapely
 
@@ -252,7 +252,7 @@ class Junction(Shape):
     at_m: tuple[float, float]
     incoming_lanes: tuple[str, ...]
 
-    def _check_edges(self, shape_m: NDArray[np.float64]) -> None:
+    def _check_edges(self, shape_m: FloatArray) -> None:
         """Raise an InputError when it would take long to repair or to cut the outline."""
         import shapely
 
@@ -374,7 +374,7 @@ class Network:
         ends = np.array([edge.start_m for edge in self.edges] + [edge.end_m for edge in self.edges])
         return float(np.hypot(*(ends.max(axis=0) - ends.min(axis=0))))
 
-    def links(self, vclass: str) -> NDArray[np.int64]:
+    def links(self, vclass: str) -> IntArray:
         """Return the connections that a vClass may use, shape (n, 3): source, target, and 1 for a turnaround."""
         usable = []
         for connection in self.connections:

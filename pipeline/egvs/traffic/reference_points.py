@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, IntArray
@@ -185,7 +184,7 @@ class ReferencePoints:
 
     def _ahead(self) -> tuple[float, float]:
         """Return the median distance ahead in lengths, and its standard error; infinite where too few turn."""
-        values: NDArray[np.float64] = np.array(self.ahead)
+        values: FloatArray = np.array(self.ahead)
         if len(values) < MIN_TURNS:
             return (MIN_AHEAD + MAX_AHEAD) / 2.0, np.inf
         spread = 1.4826 * float(np.median(np.abs(values - np.median(values))))

@@ -24,10 +24,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic
-from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 from egvs.core.wording import format_percent, number_of
 from egvs.traffic import lane_alignment
 from egvs.traffic.lane_alignment import Alignment
@@ -209,7 +208,7 @@ class RoadCheck:
                 first, motion_rad, moved_m_s = first[chosen], motion_rad[chosen], moved_m_s[chosen]
             self._count_positions(self._lanes, xy_m[first], motion_rad, moved_m_s)
 
-    def _is_around(self, xy_m: FloatArray, margin_m: float) -> NDArray[np.bool_]:
+    def _is_around(self, xy_m: FloatArray, margin_m: float) -> BoolArray:
         low_m = np.array(self.region.origin_m[:2])
         return _is_inside(xy_m, low_m - margin_m, low_m + self.region.size_m[:2] + margin_m)
 
@@ -468,20 +467,20 @@ def _motions(vehicle: IntArray, time_ms: IntArray, xy_m: FloatArray) -> tuple[In
     motion_m = xy_m[second] - xy_m[first]
     duration_s = (time_ms[second] - time_ms[first]) / 1000.0
     distance_m = np.hypot(*motion_m.T)
-    same_vehicle: NDArray[np.bool_] = vehicle[second] == vehicle[first]
+    same_vehicle: BoolArray = vehicle[second] == vehicle[first]
     moves = same_vehicle & (duration_s > 0.0) & (duration_s <= MAX_BASE_S)
     moves &= (distance_m >= MIN_MOTION_M) & (distance_m > MOVING_M_S * duration_s)
     moves &= distance_m <= np.maximum(MAX_SPEED_M_S * duration_s, MIN_JUMP_M)
     return first[moves], second[moves], motion_m[moves]
 
 
-def _is_inside(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> NDArray[np.bool_]:
+def _is_inside(xy_m: FloatArray, low_m: FloatArray, high_m: FloatArray) -> BoolArray:
     """Return whether positions (n, 2) are in a rectangle, (n,)."""
-    inside: NDArray[np.bool_] = np.all((xy_m >= low_m) & (xy_m <= high_m), axis=1)
+    inside: BoolArray = np.all((xy_m >= low_m) & (xy_m <= high_m), axis=1)
     return inside
 
 
-def _mark(rows: IntArray, count: int) -> NDArray[np.bool_]:
+def _mark(rows: IntArray, count: int) -> BoolArray:
     """Return which of ``count`` rows are among ``rows``."""
     marked = np.zeros(count, dtype=np.bool_)
     marked[rows] = True
@@ -499,5 +498,4 @@ def _distances_m(lanes: RoadLanes, xy_m: FloatArray, motion_rad: FloatArray) -> 
 
 def _wrap(angle_rad: FloatArray) -> FloatArray:
     """Return angles from -pi to pi."""
-    wrapped: FloatArray = np.mod(angle_rad + np.pi, 2.0 * np.pi) - np.pi
-    return wrapped
+    return np.mod(angle_rad + np.pi, 2.0 * np.pi) - np.pi

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core import polylines
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.traffic.network import LANE_WIDTH_M, Network, is_carriageway
 
 LEVEL_M = 1.5
@@ -144,7 +144,7 @@ class RoadLanes:
         half_width_m = self._half_widths_m.max()
         return np.array([points_m.min(axis=0) - half_width_m, points_m.max(axis=0) + half_width_m])
 
-    def in_junctions(self, xy_m: FloatArray) -> NDArray[np.bool_]:
+    def in_junctions(self, xy_m: FloatArray) -> BoolArray:
         """Return whether positions (n, 2) are inside the outline of a junction, (n,)."""
         import shapely
 
@@ -229,8 +229,7 @@ class RoadLanes:
         samples_m = self._sample(_LEVEL_SAMPLE_M)
         lanes = self.near(samples_m[:, :2], _BESIDE_M)
         is_other = np.abs(lanes.height_m - samples_m[lanes.row, 2]) > LEVEL_M
-        stacked_m: FloatArray = samples_m[np.unique(lanes.row[is_other]), :2]
-        return stacked_m
+        return samples_m[np.unique(lanes.row[is_other]), :2]
 
     def _levels(self, xy_m: FloatArray, yaw_rad: FloatArray, nearest_m: FloatArray) -> list[list[tuple[float, float]]]:
         """Return the levels at each position from the lowest on: their height, and their cost."""

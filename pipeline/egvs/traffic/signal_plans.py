@@ -27,6 +27,7 @@ from pydantic import ValidationError
 from egvs.core import files
 from egvs.core.digests import forget_file
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
 from egvs.core.numbers import number_or_nan
 from egvs.core.table_columns import parse_header
 from egvs.core.wording import list_first, number_of, shorten_id
@@ -42,7 +43,6 @@ from egvs.traffic.approaches import (
     parse_side,
     side_distance,
 )
-from egvs.traffic.directions import Floats
 from egvs.traffic.signals import CROSSING, Link, Phase, Program, Signal, read_signals, replace_programs
 
 _ALL = "all"
@@ -302,7 +302,7 @@ def agree(a: Link, b: Link) -> bool:
     return False
 
 
-def _cosine(a: Floats, b: Floats) -> float:
+def _cosine(a: FloatArray, b: FloatArray) -> float:
     return float(a @ b / np.sqrt((a @ a) * (b @ b)))
 
 

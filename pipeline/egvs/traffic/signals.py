@@ -18,11 +18,12 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
 from egvs.core.wording import shorten_id
 from egvs.formats import xml
 from egvs.traffic import network
 from egvs.traffic.approach_names import ApproachNames, disambiguate_approaches
-from egvs.traffic.directions import TURNS, U_TURN, Floats
+from egvs.traffic.directions import TURNS, U_TURN
 from egvs.traffic.signal_clock import PARAM as CLOCK_PARAM
 from egvs.traffic.signal_clock import SignalClock
 
@@ -73,7 +74,7 @@ class Link:
     movement: str
     edge: str
     street: str
-    heading: Floats | None
+    heading: FloatArray | None
     foes: frozenset[int] = frozenset()
     yields_to: frozenset[int] = frozenset()
     side: str = ""

@@ -456,8 +456,7 @@ def _write_trips(
 def _departures(timing: Timing, trips_per_s: float) -> FloatArray:
     """Return departures at regular intervals, in seconds."""
     count = int(np.ceil((timing.end_ms - timing.begin_ms) / 1000.0 * trips_per_s))
-    departs_s: FloatArray = timing.begin_ms / 1000.0 + np.arange(count) / trips_per_s
-    return departs_s
+    return timing.begin_ms / 1000.0 + np.arange(count) / trips_per_s
 
 
 def _write_flow(

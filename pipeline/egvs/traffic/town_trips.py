@@ -16,10 +16,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.scenario.traffic_config import TrafficConfig, VehicleKind
 from egvs.traffic import demand
 from egvs.traffic.demand import Trip
@@ -98,7 +97,7 @@ def _normalised(weights: FloatArray) -> FloatArray:
     return weights / total if total > 0 else weights
 
 
-def _connected_edges(links: IntArray, usable: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _connected_edges(links: IntArray, usable: BoolArray) -> tuple[BoolArray, BoolArray]:
     """Return which edges reach the largest strongly connected part of a network, and which are reached from it."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import breadth_first_order, connected_components
@@ -184,8 +183,8 @@ class _DrawnEnds(NamedTuple):
 
     origin: IntArray
     target: IntArray
-    starts_at_fringe: NDArray[np.bool_]
-    ends_at_fringe: NDArray[np.bool_]
+    starts_at_fringe: BoolArray
+    ends_at_fringe: BoolArray
 
     @classmethod
     def empty(cls, count: int) -> _DrawnEnds:

@@ -13,13 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from egvs.core import plugins
 from egvs.core.errors import Diagnostic, InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
@@ -42,7 +40,7 @@ _REQUIRED = ("KEYS", "files", "modules", "frame_count", "record", "for_new")
 class CoveredArea(Protocol):
     """The area that a recording could see."""
 
-    def contains(self, xy_m: FloatArray) -> NDArray[np.bool_]:
+    def contains(self, xy_m: FloatArray) -> BoolArray:
         """Return whether points (n, 2) are inside, (n,)."""
 
 

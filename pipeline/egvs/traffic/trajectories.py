@@ -14,18 +14,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.artefacts.parquet import ArtefactWriter
 from egvs.core.errors import Diagnostic, RunError
-from egvs.core.grid import Roi
+from egvs.core.grid import BoolArray, IntArray, Roi
 from egvs.core.progress import ProgressCallback
 from egvs.core.wording import by_number, format_percent, number_of
 from egvs.scenario.model import Scenario
 from egvs.traffic import fcd, vehicle_boxes
 from egvs.traffic.locks import DemandKey, StreetNames, describe_distance, is_inside
 from egvs.traffic.recording import Recording, demand_key
-from egvs.traffic.vehicle_boxes import BoxChange, Ints, TrafficHook, VehicleBoxes
+from egvs.traffic.vehicle_boxes import BoxChange, TrafficHook, VehicleBoxes
 
 STANDING_M_S = 0.1
 """A vehicle slower than this is standing."""
@@ -61,7 +60,7 @@ def describe_location(at_m: tuple[float, float], roi: Roi) -> str:
     return f"x {at_m[0]:.0f} m, y {at_m[1]:.0f} m ({describe_distance(at_m, roi)})"
 
 
-def find_overlaps(boxes: VehicleBoxes) -> NDArray[np.int64]:
+def find_overlaps(boxes: VehicleBoxes) -> IntArray:
     """Find the boxes that overlap in the same frame, after shrinking each by 1 mm on all sides.
 
     Exact for rectangles (separating axes). Candidate pairs come from a grid of square cells that are at least as wide
@@ -108,7 +107,7 @@ def find_overlaps(boxes: VehicleBoxes) -> NDArray[np.int64]:
     return np.concatenate(overlaps)
 
 
-def _boxes_overlap(boxes: VehicleBoxes, a: Ints, b: Ints) -> NDArray[np.bool_]:
+def _boxes_overlap(boxes: VehicleBoxes, a: IntArray, b: IntArray) -> BoolArray:
     dx, dy = boxes.x_m[b] - boxes.x_m[a], boxes.y_m[b] - boxes.y_m[a]
     cos_a, sin_a = np.cos(boxes.yaw_rad[a]), np.sin(boxes.yaw_rad[a])
     cos_b, sin_b = np.cos(boxes.yaw_rad[b]), np.sin(boxes.yaw_rad[b])
@@ -121,7 +120,7 @@ def _boxes_overlap(boxes: VehicleBoxes, a: Ints, b: Ints) -> NDArray[np.bool_]:
     separate |= np.abs(dx * cos_b + dy * sin_b) >= long_b + long_a * along + wide_a * across
     separate |= np.abs(dy * cos_b - dx * sin_b) >= wide_b + long_a * across + wide_a * along
     separate |= np.abs(boxes.z_m[a] - boxes.z_m[b]) >= (boxes.height_m[a] + boxes.height_m[b]) / 2 - 2 * _SHRINK_M
-    overlap: NDArray[np.bool_] = np.logical_not(separate)
+    overlap: BoolArray = np.logical_not(separate)
     return overlap
 
 
@@ -129,7 +128,7 @@ def _boxes_overlap(boxes: VehicleBoxes, a: Ints, b: Ints) -> NDArray[np.bool_]:
 class UncountedKind:
     """Statistics of a kind that does not count as a vehicle: number in each frame, and names."""
 
-    in_frame: Ints
+    in_frame: IntArray
     names: set[str] = field(default_factory=set)
 
     def to_json(self) -> dict[str, Any]:
@@ -200,7 +199,7 @@ class TrafficStatistics:
     """
 
     frames: int
-    vehicles: Ints = field(init=False)
+    vehicles: IntArray = field(init=False)
     names: set[str] = field(default_factory=set)
     rows: int = 0
     speed_sum: float = 0.0
@@ -259,7 +258,7 @@ class TrafficStatistics:
             is_blocker = standing_frames >= self.blocker_frames
             self.overlaps_in_region += int(np.count_nonzero((in_region & is_blocker)[pairs].any(axis=1)))
 
-    def _add_twins(self, boxes: VehicleBoxes, pairs: Ints) -> None:
+    def _add_twins(self, boxes: VehicleBoxes, pairs: IntArray) -> None:
         """Count the overlaps whose boxes have the same centre."""
         centres_m = np.column_stack([boxes.x_m, boxes.y_m, boxes.z_m])
         distance_m = np.linalg.norm(centres_m[pairs[:, 0]] - centres_m[pairs[:, 1]], axis=1)
@@ -269,7 +268,7 @@ class TrafficStatistics:
             one, other = boxes.code[twins[0]]
             self.twins = boxes.names[one], boxes.names[other]
 
-    def _add_uncounted(self, boxes: VehicleBoxes, uncounted: NDArray[np.bool_], pairs: Ints) -> None:
+    def _add_uncounted(self, boxes: VehicleBoxes, uncounted: BoolArray, pairs: IntArray) -> None:
         """Add the boxes that do not count as vehicles, and the overlaps of such boxes."""
         end = boxes.first_frame + boxes.frames
         for kind in np.unique(boxes.kind[uncounted]):
@@ -281,7 +280,7 @@ class TrafficStatistics:
             kinds = sorted(boxes.kinds[boxes.kind[i]] for i in pair)
             self.mixed_overlaps[" and ".join(kinds)] += 1
 
-    def _add_standing(self, boxes: VehicleBoxes, end: int) -> Ints:
+    def _add_standing(self, boxes: VehicleBoxes, end: int) -> IntArray:
         """Follow the runs of frames in which each vehicle is standing, across groups.
 
         Return for how many frames each vehicle has stood; -1 for those that move.
@@ -349,21 +348,21 @@ class TrafficStatistics:
         return values
 
 
-def centres_in_region(boxes: VehicleBoxes, region: Roi) -> NDArray[np.bool_]:
+def centres_in_region(boxes: VehicleBoxes, region: Roi) -> BoolArray:
     """Return whether the centre of each box is in a region, seen from above."""
     (x_m, y_m), (width_m, depth_m) = region.origin_m[:2], region.size_m[:2]
-    inside: NDArray[np.bool_] = (boxes.x_m >= x_m) & (boxes.x_m <= x_m + width_m)
+    inside: BoolArray = (boxes.x_m >= x_m) & (boxes.x_m <= x_m + width_m)
     return inside & (boxes.y_m >= y_m) & (boxes.y_m <= y_m + depth_m)
 
 
-def _vehicle_pairs(boxes: VehicleBoxes, part: Ints, pairs: Ints) -> Ints:
+def _vehicle_pairs(boxes: VehicleBoxes, part: IntArray, pairs: IntArray) -> IntArray:
     """Convert pairs of parts to pairs of different vehicles, as positions among the first parts; no duplicates."""
     pairs = pairs[boxes.code[pairs[:, 0]] != boxes.code[pairs[:, 1]]]  # parts of one vehicle touch at their joint
     vehicle = np.cumsum(part == 0) - 1
     return np.unique(vehicle[pairs], axis=0).reshape(-1, 2)
 
 
-def _boxes_per_frame(boxes: VehicleBoxes, frame: Ints) -> Ints:
+def _boxes_per_frame(boxes: VehicleBoxes, frame: IntArray) -> IntArray:
     """Count the elements of ``frame`` in each frame of the group."""
     return np.bincount(frame - boxes.first_frame, minlength=boxes.frames)
 
@@ -538,6 +537,8 @@ def traffic_warnings(
             " here"
         )
         hint = "Enlarge the junction, or use signals where vehicles wait on it to give way."
+        if recording.tracks is not None:
+            hint = "Check times, positions and sizes of the tracks."
         if statistics.twins is not None and statistics.same_place >= MIN_TWIN_SHARE * statistics.overlapping_pairs:
             where = recording.where
             same_place = format_percent(statistics.same_place / statistics.overlapping_pairs, 0)

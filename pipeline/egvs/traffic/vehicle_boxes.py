@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from egvs.artefacts.frame_boxes import MAX_BOX_M, MIN_BOX_M
 from egvs.core.errors import InputError, RunError
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.traffic.fcd import FrameGroup
 
 if TYPE_CHECKING:
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 _POSITION_DIGITS, _ANGLE_DIGITS = 6, 9
 _NUMBERS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 _SIZE_KEYS = ("length_m", "width_m", "height_m")
 
 
@@ -82,31 +80,31 @@ class VehicleBoxes:
 
     first_frame: int
     frames: int
-    frame: Ints
+    frame: IntArray
     names: list[str]
-    code: Ints
+    code: IntArray
     kinds: list[str]
-    kind: Ints
-    x_m: Floats
-    y_m: Floats
-    z_m: Floats
-    yaw_rad: Floats
-    pitch_rad: Floats
-    length_m: Floats
-    width_m: Floats
-    height_m: Floats
-    speed_m_s: Floats
+    kind: IntArray
+    x_m: FloatArray
+    y_m: FloatArray
+    z_m: FloatArray
+    yaw_rad: FloatArray
+    pitch_rad: FloatArray
+    length_m: FloatArray
+    width_m: FloatArray
+    height_m: FloatArray
+    speed_m_s: FloatArray
     types: list[str] = field(default_factory=list)
-    type_code: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    part: Ints | None = None
-    uncounted: NDArray[np.bool_] | None = None
+    type_code: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    part: IntArray | None = None
+    uncounted: BoolArray | None = None
 
-    def rows(self, index: Ints) -> dict[str, Any]:
+    def rows(self, index: IntArray) -> dict[str, Any]:
         """Return all arrays at some positions, by name."""
         arrays = {name: value for name, value in self.__dict__.items() if isinstance(value, np.ndarray)}
         return {name: value[index] for name, value in arrays.items()}
 
-    def select(self, mask: NDArray[np.bool_]) -> VehicleBoxes:
+    def select(self, mask: BoolArray) -> VehicleBoxes:
         """Return some of the boxes."""
         return replace(self, **self.rows(np.flatnonzero(mask)))
 
@@ -197,8 +195,14 @@ def _check_sizes(types: list[str], sizes: Mapping[str, VehicleSize], where: str)
 
 
 def box_centres(
-    x: Floats, y: Floats, z: Floats, angle_deg: Floats, slope_deg: Floats, length_m: Floats, height_m: Floats
-) -> tuple[Floats, Floats, Floats]:
+    x: FloatArray,
+    y: FloatArray,
+    z: FloatArray,
+    angle_deg: FloatArray,
+    slope_deg: FloatArray,
+    length_m: FloatArray,
+    height_m: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Compute box centres from front bumpers.
 
     Parameters
@@ -225,7 +229,7 @@ def box_centres(
     )
 
 
-def yaw_from_angle(angle_deg: Floats) -> Floats:
+def yaw_from_angle(angle_deg: FloatArray) -> FloatArray:
     """Convert degrees clockwise from north to radians counter-clockwise from +x, in (-pi, pi], rounded."""
     degrees = 90.0 - np.asarray(angle_deg, dtype=np.float64)
     degrees = degrees - 360.0 * np.ceil((degrees - 180.0) / 360.0)
@@ -234,12 +238,12 @@ def yaw_from_angle(angle_deg: Floats) -> Floats:
     return np.where(np.abs(rounded) > np.pi, np.pi, rounded)
 
 
-def round_m(values: Floats) -> Floats:
+def round_m(values: FloatArray) -> FloatArray:
     """Round metres to 1 micrometre, without negative zeros."""
     return np.round(values, _POSITION_DIGITS) + 0.0
 
 
-def round_rad(values: Floats) -> Floats:
+def round_rad(values: FloatArray) -> FloatArray:
     """Round radians to 1 nanoradian, without negative zeros."""
     return np.round(values, _ANGLE_DIGITS) + 0.0
 
@@ -256,7 +260,7 @@ def _fill_speeds(boxes: VehicleBoxes, period_s: float) -> VehicleBoxes:
     return replace(boxes, speed_m_s=np.where(np.isnan(boxes.speed_m_s), speed, boxes.speed_m_s))
 
 
-def _sorted_codes(column: pa.ChunkedArray) -> tuple[list[str], Ints]:
+def _sorted_codes(column: pa.ChunkedArray) -> tuple[list[str], IntArray]:
     """Return the distinct values, sorted by code point, and the position of each row's value among them."""
     encoded = column.combine_chunks().dictionary_encode()
     if isinstance(encoded, pa.ChunkedArray):
@@ -268,7 +272,7 @@ def _sorted_codes(column: pa.ChunkedArray) -> tuple[list[str], Ints]:
     return [values[i] for i in order], rank[encoded.indices.to_numpy(zero_copy_only=False).astype(np.int64)]
 
 
-def _decode_strings(values: list[str], code: Ints) -> pa.Array:
+def _decode_strings(values: list[str], code: IntArray) -> pa.Array:
     return pa.array(values, type=pa.string()).take(pa.array(code))
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.traffic.network import LANE_WIDTH_M, Lane, Network, Shape, is_carriageway
 from egvs.world import clearances
 
@@ -102,11 +102,11 @@ class Carriageway:
                 road_m[point] = height_m
         return lanes
 
-    def in_junctions(self, at_m: FloatArray) -> NDArray[np.bool_]:
+    def in_junctions(self, at_m: FloatArray) -> BoolArray:
         """Return whether each point (n, 2) is well inside a junction, and not in a walking area; (n,) bool."""
         import shapely
 
-        inside: NDArray[np.bool_] = shapely.intersects(self._junction_interiors, shapely.points(at_m))
+        inside: BoolArray = shapely.intersects(self._junction_interiors, shapely.points(at_m))
         return inside
 
     @cached_property

@@ -9,13 +9,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from egvs.core.grid import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from shapely import Polygon
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 _MERGED_DIGITS = 8
 """Vertices that are equal when rounded to this number of decimals are one."""
@@ -24,7 +23,7 @@ _WOUND = 10
 """Triangles that tell in which direction a triangulation is wound."""
 
 
-def extrude_polygon(polygon: Polygon, height_m: float) -> tuple[Floats, Ints]:
+def extrude_polygon(polygon: Polygon, height_m: float) -> tuple[FloatArray, IntArray]:
     """Return vertices and faces (outwards) of a closed prism.
 
     Parameters
@@ -52,7 +51,7 @@ def extrude_polygon(polygon: Polygon, height_m: float) -> tuple[Floats, Ints]:
     return _merge_vertices(np.concatenate([bottom, top, walls]), np.concatenate(faces))
 
 
-def _triangulate(polygon: Polygon) -> tuple[Floats, Ints]:
+def _triangulate(polygon: Polygon) -> tuple[FloatArray, IntArray]:
     """Return corners (n, 2) and triangles (m, 3), counter-clockwise, of a polygon."""
     from mapbox_earcut import triangulate_float64
 
@@ -69,7 +68,7 @@ def _triangulate(polygon: Polygon) -> tuple[Floats, Ints]:
     return corners, triangles
 
 
-def _boundary_edges(triangles: Ints) -> Ints:
+def _boundary_edges(triangles: IntArray) -> IntArray:
     """Return the edges that one triangle has alone, (n, 2), in the order of their larger, then smaller corner."""
     edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     low, high = edges.min(axis=1), edges.max(axis=1)
@@ -79,7 +78,7 @@ def _boundary_edges(triangles: Ints) -> Ints:
     return edges[order[is_new[:-1] & is_new[1:]]]
 
 
-def _merge_vertices(vertices_m: Floats, faces: Ints) -> tuple[Floats, Ints]:
+def _merge_vertices(vertices_m: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
     """Merge equal vertices, and drop those that no face has; the others keep their order."""
     is_used = np.zeros(len(vertices_m), dtype=np.bool_)
     is_used[faces] = True

@@ -42,7 +42,8 @@ def scenario_georeference(scenario: Scenario) -> Georeference:
         When a projection is not in metres or distorts lengths, or when ``[crs]`` contradicts the network.
     """
     declared = _declared_frame(scenario)
-    from_network = _network_frame(scenario)
+    stated = network_location(scenario)
+    from_network = None if stated is None else network_world_frame(stated.location)
     if from_network is not None:
         _check_network_scale(from_network, scenario)
     if declared is not None:
@@ -169,11 +170,6 @@ def _network_path(scenario: Scenario) -> Path | None:
     except InputError:
         return None
     return path if path is not None and path.is_file() else None
-
-
-def _network_frame(scenario: Scenario) -> WorldFrame | None:
-    stated = network_location(scenario)
-    return None if stated is None else network_world_frame(stated.location)
 
 
 def _check_declared_scale(frame: WorldFrame, scenario: Scenario) -> None:

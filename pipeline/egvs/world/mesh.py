@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from egvs.core import files
 from egvs.core.digests import open_input
 from egvs.core.errors import InputError
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 
 _VERTEX = np.dtype([("xyz", "<f8", 3)])
 _FACE = np.dtype([("n", "u1"), ("corners", "<i4", 3), ("solid", "<i4")])
@@ -44,23 +45,23 @@ class World:
         (name, kind) of each solid, e.g. ("tower_NE", "building").
     """
 
-    vertices_m: NDArray[np.float64]
+    vertices_m: FloatArray
     faces: NDArray[np.int32]
     solid_of_face: NDArray[np.int32]
     solids: tuple[tuple[str, str], ...]
 
     @cached_property
-    def triangles_m(self) -> NDArray[np.float64]:
+    def triangles_m(self) -> FloatArray:
         """Corners of each triangle, (m, 3, 3), world frame."""
         return self.vertices_m[self.faces]
 
     @cached_property
-    def bounds_xy_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def bounds_xy_m(self) -> tuple[FloatArray, FloatArray]:
         """Minimum and maximum x and y of each triangle, (m, 2) each."""
         return self.triangles_m[:, :, :2].min(axis=1), self.triangles_m[:, :, :2].max(axis=1)
 
     @cached_property
-    def closed(self) -> NDArray[np.bool_]:
+    def closed(self) -> BoolArray:
         """Whether each solid is closed: each directed edge of its triangles has an opposite one. (solids,) bool."""
         edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
         solid = np.repeat(self.solid_of_face, 3)
@@ -80,7 +81,7 @@ class World:
         return is_closed
 
     @cached_property
-    def signs(self) -> NDArray[np.int64]:
+    def signs(self) -> IntArray:
         """+1 for solids whose triangles face outwards, -1 for inwards (negative volume); (solids,) int64."""
         centre = self.vertices_m.mean(axis=0) if len(self.vertices_m) else 0.0
         t = self.triangles_m - centre

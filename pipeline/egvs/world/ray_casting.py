@@ -25,12 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
-from egvs.core.grid import Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 from egvs.core.special import cosdg, sindg
 from egvs.kernels import ray_triangle
 from egvs.world.mesh import World
-
-Floats = NDArray[np.float64]
 
 _RIM_M = 1e-4
 # rim per largest coordinate of a triangle: eight times the rounding of float32
@@ -70,11 +68,11 @@ class EmptyScan:
     """
 
     beam: NDArray[np.uint32]
-    ends_m: Floats
-    returned: NDArray[np.bool_]
+    ends_m: FloatArray
+    returned: BoolArray
     ambiguous: int = 0
-    weight: Floats | None = None
-    face: NDArray[np.int64] | None = None
+    weight: FloatArray | None = None
+    face: IntArray | None = None
 
 
 class Caster:
@@ -93,7 +91,9 @@ class Caster:
         Maximum range of these beams.
     """
 
-    def __init__(self, world: World, roi: Roi, starts_m: Floats | None = None, range_m: float = float("inf")) -> None:
+    def __init__(
+        self, world: World, roi: Roi, starts_m: FloatArray | None = None, range_m: float = float("inf")
+    ) -> None:
         self._origin_m = np.asarray(roi.origin_m, dtype=np.float64)
         self._size_m = np.asarray(roi.size_m, dtype=np.float64)
         triangles = world.triangles_m - self._origin_m
@@ -119,7 +119,7 @@ class Caster:
 
             self._tree = TriangleTree(enlarged)
 
-    def scan(self, position_m: tuple[float, float, float], directions: Floats, range_m: float) -> EmptyScan:
+    def scan(self, position_m: tuple[float, float, float], directions: FloatArray, range_m: float) -> EmptyScan:
         """Cast the beams of a sensor that can meet the region of interest.
 
         Parameters
@@ -136,7 +136,7 @@ class Caster:
         count = ray_triangle.select_beams(o, directions, self._size_m, range_m, beam)
         return self._cast(o, beam[:count].copy(), directions, range_m)[0]
 
-    def sweep(self, position_m: tuple[float, float, float], directions: Floats, range_m: float) -> EmptyScan:
+    def sweep(self, position_m: tuple[float, float, float], directions: FloatArray, range_m: float) -> EmptyScan:
         """Cast all beams of a sensor, and return the faces that they hit.
 
         The caster must not have ``starts_m``: beams may leave the region of interest anywhere. Parameters are those of
@@ -148,7 +148,7 @@ class Caster:
         face[scan.returned] = self._faces[triangle[scan.returned]]
         return replace(scan, face=face)
 
-    def first_hits(self, o_roi_m: Floats, d: Floats, range_m: float = float("inf")) -> tuple[Floats, int]:
+    def first_hits(self, o_roi_m: FloatArray, d: FloatArray, range_m: float = float("inf")) -> tuple[FloatArray, int]:
         """Return the ranges of first hits.
 
         Parameters
@@ -170,8 +170,8 @@ class Caster:
         return ranges, scan.ambiguous
 
     def _cast(
-        self, o: Floats, beam: NDArray[np.uint32], d: Floats, range_m: float, ranges: Floats | None = None
-    ) -> tuple[EmptyScan, NDArray[np.int64]]:
+        self, o: FloatArray, beam: NDArray[np.uint32], d: FloatArray, range_m: float, ranges: FloatArray | None = None
+    ) -> tuple[EmptyScan, IntArray]:
         """Return where beams end, and the triangle that each hits.
 
         ``o`` is the sensor in the frame of the region of interest, ``d`` the directions of all its beams; ``ranges`` is
@@ -195,7 +195,7 @@ class Caster:
         return EmptyScan(beam, hits.ends, hits.returned, len(ambiguous)), hits.triangle
 
 
-def reachable_shapes(shapes: Floats, roi: Roi, sites_m: Floats, range_m: float = float("inf")) -> NDArray[np.bool_]:
+def reachable_shapes(shapes: FloatArray, roi: Roi, sites_m: FloatArray, range_m: float = float("inf")) -> BoolArray:
     """Return which shapes may be hit by beams that start at a site and meet the region of interest.
 
     If the complete region is at least as high as all sites along a normal n, beams rise along n, and shapes below the
@@ -226,13 +226,13 @@ def reachable_shapes(shapes: Floats, roi: Roi, sites_m: Floats, range_m: float =
     is_rising = (_corners(roi) @ normals.T).min(axis=0) >= (sites @ normals.T).max(axis=0)
     gap = np.maximum(shapes.min(axis=1) - sites.max(axis=0), sites.min(axis=0) - shapes.max(axis=1))
     distance = np.sqrt((np.maximum(gap, 0.0) ** 2).sum(axis=1))
-    is_reachable: NDArray[np.bool_] = distance <= range_m + _CLEARANCE_M
+    is_reachable: BoolArray = distance <= range_m + _CLEARANCE_M
     for normal in normals[is_rising]:
         is_reachable &= (shapes @ normal).max(axis=1) >= (sites @ normal).min() - _CLEARANCE_M
     return is_reachable
 
 
-def shapes_between(shapes: Floats, roi: Roi, sites_m: Floats) -> NDArray[np.bool_]:
+def shapes_between(shapes: FloatArray, roi: Roi, sites_m: FloatArray) -> BoolArray:
     """Return which shapes may reach into the convex hull of the region of interest and any one site.
 
     Parameters
@@ -260,19 +260,19 @@ def shapes_between(shapes: Floats, roi: Roi, sites_m: Floats) -> NDArray[np.bool
 
 
 @cache
-def _separating_normals() -> Floats:
+def _separating_normals() -> FloatArray:
     """Return normals of planes that may separate shapes, (192, 3)."""
     angles_deg = np.arange(64) * (360 / 64)
     circle = np.column_stack([cosdg(angles_deg), sindg(angles_deg), np.zeros(64)])
     return np.concatenate([np.roll(circle, axis, axis=1) for axis in range(3)])
 
 
-def _corners(roi: Roi) -> Floats:
+def _corners(roi: Roi) -> FloatArray:
     """Return the corners of the region of interest in its own frame, (8, 3)."""
     return np.array(list(itertools.product(*((0.0, size) for size in roi.size_m))))
 
 
-def with_planes(triangles: Floats) -> tuple[Floats, Floats, NDArray[np.int64]]:
+def with_planes(triangles: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     """Select the triangles that have an area.
 
     Parameters
@@ -290,7 +290,7 @@ def with_planes(triangles: Floats) -> tuple[Floats, Floats, NDArray[np.int64]]:
     return triangles[numbers], _planes(triangles[numbers]), numbers
 
 
-def touches_sensor(triangles: Floats) -> NDArray[np.bool_]:
+def touches_sensor(triangles: FloatArray) -> BoolArray:
     """Return whether each triangle (n, 3, 3), relative to a sensor, touches it (within 1 micrometre); (n,) bool."""
     with_area, planes, numbers = with_planes(triangles)
     touched = np.empty(len(numbers), dtype=np.bool_)
@@ -300,26 +300,26 @@ def touches_sensor(triangles: Floats) -> NDArray[np.bool_]:
     return touches
 
 
-def _cross(triangles: Floats) -> Floats:
+def _cross(triangles: FloatArray) -> FloatArray:
     """Return normals whose length is twice the area, (n, 3); exactly zero without area."""
-    cross: Floats = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    cross: FloatArray = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     return np.where(((cross**2).sum(axis=1) > 0.0)[:, None], cross, 0.0)
 
 
-def _unit_vectors(vectors: Floats) -> Floats:
+def _unit_vectors(vectors: FloatArray) -> FloatArray:
     """Return vectors (n, 3) scaled to length 1."""
-    units: Floats = vectors / np.sqrt((vectors**2).sum(axis=1))[:, None]
+    units: FloatArray = vectors / np.sqrt((vectors**2).sum(axis=1))[:, None]
     return units
 
 
-def _planes(triangles: Floats) -> Floats:
+def _planes(triangles: FloatArray) -> FloatArray:
     """Return the four planes of each triangle, see :func:`egvs.kernels.ray_triangle.triangle_planes`."""
     planes = np.empty((len(triangles), 4, 4))
     ray_triangle.triangle_planes(triangles, _unit_vectors(_cross(triangles)), planes)
     return planes
 
 
-def _morton_order(points: Floats) -> NDArray[np.int64]:
+def _morton_order(points: FloatArray) -> IntArray:
     """Return an order of points (n, 3) that keeps neighbours in space together: a Z-order curve (Morton 1966)."""
     low = points.min(axis=0, initial=np.inf)
     scale = 2.0**20 / max(float((points - low).max(initial=0.0)), _PADDING_M) * (1 - 1e-9)
@@ -331,7 +331,7 @@ def _morton_order(points: Floats) -> NDArray[np.int64]:
     return np.argsort(key, kind="stable")
 
 
-def _box_tree(triangles: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def _box_tree(triangles: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return boxes around triangles, around groups of these, up to a single one; and where each level starts."""
     low = triangles.min(axis=1) - _PADDING_M
     high = triangles.max(axis=1) + _PADDING_M
@@ -344,7 +344,7 @@ def _box_tree(triangles: Floats) -> tuple[Floats, NDArray[np.int64]]:
     return np.concatenate(levels), np.cumsum([0, *map(len, levels)])
 
 
-def _enlarge(triangles: Floats) -> tuple[Floats, NDArray[np.int32]]:
+def _enlarge(triangles: FloatArray) -> tuple[FloatArray, NDArray[np.int32]]:
     """Return the triangles for Embree, (k, 3, 3), and the exact triangle of each: FIN for a fin; then -1, for no hit.
 
     Large slivers are split first. A triangle is scaled from its incentre, so that its sides move outwards by the rim.
@@ -371,12 +371,12 @@ def _enlarge(triangles: Floats) -> tuple[Floats, NDArray[np.int32]]:
     return np.concatenate([enlarged, second, fins]), owner.astype(np.int32)
 
 
-def _opposite_sides(triangles: Floats) -> Floats:
+def _opposite_sides(triangles: FloatArray) -> FloatArray:
     """Return the side opposite each corner, (n, 3, 3)."""
     return np.roll(triangles, -2, axis=1) - np.roll(triangles, -1, axis=1)
 
 
-def _split_large(triangles: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def _split_large(triangles: FloatArray) -> tuple[FloatArray, IntArray]:
     """Split triangles (m, 3, 3) that fill little of a large box; return the pieces and the triangle of each.
 
     They are halved at their longest sides. A beam that enters a box of Embree's tree is tested against its content, and
@@ -403,7 +403,7 @@ def _split_large(triangles: Floats) -> tuple[Floats, NDArray[np.int64]]:
         owner = np.concatenate([owner, owner[large]])
 
 
-def _fins(triangles: Floats, cross: Floats, rim: Floats) -> Floats:
+def _fins(triangles: FloatArray, cross: FloatArray, rim: FloatArray) -> FloatArray:
     """Return upright strips on the sides without a steep neighbour, (f, 3, 3).
 
     A rim in the plane of a triangle does not stop a beam along that plane. The rim of a steep neighbour does; other
@@ -436,14 +436,16 @@ def _fins(triangles: Floats, cross: Floats, rim: Floats) -> Floats:
     return np.concatenate([np.stack([corners[0], corners[i], corners[i + 1]], axis=1) for i in (1, 2)])
 
 
-def _precedes(a: Floats, b: Floats) -> NDArray[np.bool_]:
+def _precedes(a: FloatArray, b: FloatArray) -> BoolArray:
     """Return whether points a (n, 3) are before points b in lexical order."""
     x, y, z = (a - b).T
-    before: NDArray[np.bool_] = (x < 0) | ((x == 0) & ((y < 0) | ((y == 0) & (z < 0))))
+    before: BoolArray = (x < 0) | ((x == 0) & ((y < 0) | ((y == 0) & (z < 0))))
     return before
 
 
-def _rectangles(triangles: Floats, sides: Floats, cross: Floats, rim: Floats) -> tuple[Floats, Floats]:
+def _rectangles(
+    triangles: FloatArray, sides: FloatArray, cross: FloatArray, rim: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return two triangles (n, 3, 3) each that cover a triangle and its rim: a rectangle along its longest side."""
     rows = np.arange(len(triangles))
     u = _unit_vectors(sides[rows, (sides**2).sum(axis=2).argmax(axis=1)])

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError
+from egvs.core.grid import FloatArray, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats import meshes
 from egvs.formats.georeference import Georeference
@@ -33,7 +33,6 @@ from egvs.world.mesh import World
 if TYPE_CHECKING:
     from egvs.world.terrain import GroundSource, TerrainSurface
 
-Floats = NDArray[np.float64]
 
 GROUND_MARGIN_M = 500.0
 """Margin of the ground plane around everything; no sensor of the catalogue has a longer range."""
@@ -157,13 +156,13 @@ def build_world(
 class _Builder:
     """Collects solids in one mesh, and counts them."""
 
-    vertices: list[Floats] = field(default_factory=list)
-    faces: list[NDArray[np.int64]] = field(default_factory=list)
+    vertices: list[FloatArray] = field(default_factory=list)
+    faces: list[IntArray] = field(default_factory=list)
     solids: list[tuple[str, str]] = field(default_factory=list)
     counts: BuildCounts = field(default_factory=BuildCounts)
     _vertex_count: int = 0
 
-    def add(self, vertices_m: Floats, faces: NDArray[np.int64], name: str, kind: str, suffix: str = "") -> None:
+    def add(self, vertices_m: FloatArray, faces: IntArray, name: str, kind: str, suffix: str = "") -> None:
         """Add a solid; it is counted as its kind with ``suffix``."""
         self.vertices.append(np.asarray(vertices_m, dtype=np.float64))
         self.faces.append(np.asarray(faces, dtype=np.int64) + self._vertex_count)
@@ -181,7 +180,7 @@ class _Builder:
         )
 
 
-def _extrude(footprint: Footprint) -> tuple[Floats, NDArray[np.int64]]:
+def _extrude(footprint: Footprint) -> tuple[FloatArray, IntArray]:
     """Return vertices and faces (outwards) of a closed prism over a footprint."""
     vertices_m, faces = extrude_polygon(footprint.polygon, footprint.height_m - footprint.base_m)
     return vertices_m + np.array([0.0, 0.0, footprint.base_m]), faces
@@ -206,9 +205,9 @@ def _add_mesh(builder: _Builder, path: Path, config: MeshConfig, world: Georefer
         builder.add(vertices_m, triangles[rest], f"{path.stem}_surface", config.kind, " (open surface)")
 
 
-def _to_world(vertices_m: Floats, config: MeshConfig, path: Path, world: Georeference) -> Floats:
+def _to_world(vertices_m: FloatArray, config: MeshConfig, path: Path, world: Georeference) -> FloatArray:
     """Return the vertices of a mesh (n, 3) in the world frame."""
-    moved: Floats = np.add(vertices_m, config.offset_m, dtype=np.float64)
+    moved: FloatArray = np.add(vertices_m, config.offset_m, dtype=np.float64)
     if config.crs is None:
         world.check_metres(moved[:, :2], str(path), "Set offset_m, epsg or origin_deg beside the mesh's file.")
         return moved
@@ -217,13 +216,13 @@ def _to_world(vertices_m: Floats, config: MeshConfig, path: Path, world: Georefe
     return np.column_stack([reading.to_world(moved[:, :2]), moved[:, 2]])
 
 
-def _roi_corners_m(scenario: Scenario) -> Floats:
+def _roi_corners_m(scenario: Scenario) -> FloatArray:
     """Return the lowest and the highest corner of the region of interest, (2, 3)."""
     box = scenario.roi.box
     return np.array([box.origin_m, np.add(box.origin_m, box.size_m)])
 
 
-def _ground_plane(builder: _Builder, scenario: Scenario) -> tuple[Floats, NDArray[np.int64]]:
+def _ground_plane(builder: _Builder, scenario: Scenario) -> tuple[FloatArray, IntArray]:
     """Return two triangles at z = 0, facing up, with a margin around the region of interest and all solids."""
     points = np.concatenate([_roi_corners_m(scenario), *builder.vertices])
     x0, y0 = points.min(axis=0)[:2] - GROUND_MARGIN_M
@@ -232,7 +231,7 @@ def _ground_plane(builder: _Builder, scenario: Scenario) -> tuple[Floats, NDArra
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def _ground_extent_m(scenario: Scenario, footprints: Sequence[Footprint]) -> tuple[Floats, Floats]:
+def _ground_extent_m(scenario: Scenario, footprints: Sequence[Footprint]) -> tuple[FloatArray, FloatArray]:
     """Return the corners (2,) of the ground: with a margin around the region of interest and all footprints."""
     bounds = [np.reshape(footprint.polygon.bounds, (2, 2)) for footprint in footprints]
     points = np.concatenate([_roi_corners_m(scenario)[:, :2], *bounds])

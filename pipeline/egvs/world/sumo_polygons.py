@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
+from egvs.core.grid import FloatArray
 from egvs.core.numbers import number_or_nan
 from egvs.core.polygons import PairCount, repair_polygon
 from egvs.core.wording import list_first
@@ -374,7 +374,7 @@ def _coordinate_readings(
     return {True: in_degrees, False: in_metres}
 
 
-def _finite_points(points: Points) -> NDArray[np.float64]:
+def _finite_points(points: Points) -> FloatArray:
     array = np.array(points, dtype=np.float64).reshape(-1, 2)
     return array[np.isfinite(array).all(axis=1)]
 

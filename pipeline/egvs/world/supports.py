@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from egvs.core.grid import IntArray
 from egvs.world.mesh import World
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class Supports:
         The area that each covers in plan, (n,) shapely geometries, world frame.
     """
 
-    solids: NDArray[np.int64]
+    solids: IntArray
     footprints: NDArray[Any]
 
     @classmethod

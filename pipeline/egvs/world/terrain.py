@@ -25,9 +25,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core import polylines
+from egvs.core.grid import FloatArray, IntArray
 from egvs.core.limits import GROUND_POINTS
 from egvs.traffic.network import LANE_WIDTH_M, Edge, Lane, Network
 from egvs.traffic.road_lanes import RoadLanes
@@ -43,12 +43,10 @@ class GroundSource(Protocol):
     NAME: ClassVar[str]
 
     def ground(
-        self, scenario: Scenario, low_m: NDArray[np.float64] | None = None, high_m: NDArray[np.float64] | None = None
+        self, scenario: Scenario, low_m: FloatArray | None = None, high_m: FloatArray | None = None
     ) -> TerrainSurface:
         """Return the ground over a rectangle with the corners ``low_m`` and ``high_m``; by default, of the network."""
 
-
-Floats = NDArray[np.float64]
 
 MIN_RELIEF_M = 0.1
 """A network whose heights differ by no more than this is flat."""
@@ -85,10 +83,10 @@ class TerrainSurface:
         Corners of the rectangle that the faces cover, (2,) each.
     """
 
-    vertices_m: Floats
-    faces: NDArray[np.int64]
-    low_m: Floats
-    high_m: Floats
+    vertices_m: FloatArray
+    faces: IntArray
+    low_m: FloatArray
+    high_m: FloatArray
 
     @cached_property
     def _triangulation(self) -> Any:
@@ -96,7 +94,7 @@ class TerrainSurface:
 
         return Delaunay(self.vertices_m[:, :2] - self.low_m)
 
-    def height_m(self, x_m: Floats, y_m: Floats) -> Floats:
+    def height_m(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
         """Return z of the ground at points (n,).
 
         Outside of the rectangle, it is that of the nearest point on its border.
@@ -105,10 +103,10 @@ class TerrainSurface:
         margin = 1e-6 * (self.high_m - self.low_m)
         at = np.clip(np.column_stack([x_m, y_m]), self.low_m + margin, self.high_m - margin) - self.low_m
         corners, shares = self._locate(at)
-        heights: Floats = (self.vertices_m[corners, 2] * shares).sum(axis=1)
+        heights: FloatArray = (self.vertices_m[corners, 2] * shares).sum(axis=1)
         return heights
 
-    def _locate(self, at: Floats) -> tuple[NDArray[np.int64], Floats]:
+    def _locate(self, at: FloatArray) -> tuple[IntArray, FloatArray]:
         """Return the vertices (n, 3) of the triangle around each point (n, 2), and barycentric coordinates (n, 3).
 
         Walks from a triangle at the nearest vertex to the neighbour across the side that the point is beyond; on a
@@ -131,7 +129,7 @@ class TerrainSurface:
             shares[active] = _barycentric(points[mesh.simplices[face[active]]], at[active])
         return mesh.simplices[face], shares
 
-    def lowest_m(self, outline_m: Floats) -> float:
+    def lowest_m(self, outline_m: FloatArray) -> float:
         """Return the lowest z of the ground along an outline (n, 2), sampled every metre."""
         points = [outline_m[:1]]
         for start, end in itertools.pairwise(outline_m):
@@ -148,11 +146,11 @@ def relief_m(roads: Network) -> tuple[float, float]:
 
 def triangulate_ground(
     roads: Network,
-    low_m: Floats | None = None,
-    high_m: Floats | None = None,
+    low_m: FloatArray | None = None,
+    high_m: FloatArray | None = None,
     where: object = "the network",
     *,
-    beyond_m: Floats | None = None,
+    beyond_m: FloatArray | None = None,
 ) -> TerrainSurface:
     """Triangulate the ground through the lanes of a network.
 
@@ -184,10 +182,11 @@ def triangulate_ground(
     is_inside = np.all((points[:, :2] > low) & (points[:, :2] < high), axis=1)
     rim = _rim(low, high)
     rim = np.column_stack([rim, points[_nearest(points[:, :2], rim), 2]])
-    return _triangulate(np.concatenate([points[is_inside], rim]), low, high)
+    vertices = np.concatenate([points[is_inside], rim])
+    return TerrainSurface(vertices, triangulate(vertices, low), low, high)
 
 
-def _without_bridges(roads: Network, lanes: Sequence[Lane], samples: Sequence[Floats]) -> list[Floats]:
+def _without_bridges(roads: Network, lanes: Sequence[Lane], samples: Sequence[FloatArray]) -> list[FloatArray]:
     """Leave out the points (n, 3) of lanes that cross above others, within :data:`_BESIDE_M` of these."""
     heights = np.concatenate([lane.shape_m[:, 2] for lane in lanes])
     if np.ptp(heights) <= _LEVEL_M:
@@ -204,7 +203,9 @@ def _without_bridges(roads: Network, lanes: Sequence[Lane], samples: Sequence[Fl
     return kept
 
 
-def _join_terrain(lanes: Floats, terrain: Floats, low_m: Floats | None, high_m: Floats | None, where: object) -> Floats:
+def _join_terrain(
+    lanes: FloatArray, terrain: FloatArray, low_m: FloatArray | None, high_m: FloatArray | None, where: object
+) -> FloatArray:
     """Return the points (n, 3) of the ground: of lanes on the terrain, and of the terrain away from them."""
     if low_m is not None and high_m is not None:
         is_near = np.all((terrain[:, :2] > low_m - _MARGIN_M) & (terrain[:, :2] < high_m + _MARGIN_M), axis=1)
@@ -224,7 +225,7 @@ def _join_terrain(lanes: Floats, terrain: Floats, low_m: Floats | None, high_m: 
     return np.concatenate([points, _thin_points(terrain[is_beyond])]) if is_beyond.any() else points
 
 
-def _interpolate(points: Floats, at: Floats) -> Floats:
+def _interpolate(points: FloatArray, at: FloatArray) -> FloatArray:
     """Return heights (n,) at locations (n, 2) on triangles through points; NaN outside their hull."""
     from scipy.spatial import QhullError
 
@@ -241,7 +242,7 @@ def _interpolate(points: Floats, at: Floats) -> Floats:
     return heights
 
 
-def _check_point_count(roads: Network, low_m: Floats | None, high_m: Floats | None, where: object) -> None:
+def _check_point_count(roads: Network, low_m: FloatArray | None, high_m: FloatArray | None, where: object) -> None:
     """Raise an InputError when lanes are so long, or the rectangle so wide, that there are too many points."""
     shapes = [lane.shape_m for edge in roads.all_edges for lane in edge.lanes]
     length = sum(polylines.length_m(shape) for shape in shapes)
@@ -259,28 +260,37 @@ def _width_m(edge: Edge, lane: Lane) -> float:
     return LANE_WIDTH_M if lane.width_m is None else lane.width_m
 
 
-def _barycentric(triangles: Floats, at: Floats) -> Floats:
+def _barycentric(triangles: FloatArray, at: FloatArray) -> FloatArray:
     """Return barycentric coordinates (n, 3) of points (n, 2) in triangles (n, 3, 2)."""
     ax, ay = (triangles[:, 0] - at).T
     bx, by = (triangles[:, 1] - at).T
     cx, cy = (triangles[:, 2] - at).T
     areas = np.column_stack([bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx])
-    shares: Floats = areas / areas.sum(axis=1)[:, None]
+    shares: FloatArray = areas / areas.sum(axis=1)[:, None]
     return shares
 
 
-def _nearest(points: Floats, at: Floats) -> NDArray[np.int64]:
+def _nearest(points: FloatArray, at: FloatArray) -> IntArray:
     """Return the index of the nearest point for each location."""
     from scipy.spatial import KDTree
 
-    index: NDArray[np.int64] = KDTree(points).query(at)[1]
+    index: IntArray = KDTree(points).query(at)[1]
     return index
 
 
-def _triangulate(vertices: Floats, low: Floats, high: Floats) -> TerrainSurface:
+def triangulate(vertices: FloatArray, origin: FloatArray) -> IntArray:
+    """Return the Delaunay triangles of points (n, 3) from above, (m, 3) int64, facing up, in an order of their own.
+
+    Parameters
+    ----------
+    vertices
+        The points, metres.
+    origin
+        x and y of a point near them, from which they are triangulated, (2,).
+    """
     from scipy.spatial import Delaunay
 
-    faces = np.asarray(Delaunay(vertices[:, :2] - low).simplices, dtype=np.int64)
+    faces = np.asarray(Delaunay(vertices[:, :2] - origin).simplices, dtype=np.int64)
     ax, ay = vertices[faces[:, 0], :2].T
     bx, by = vertices[faces[:, 1], :2].T
     cx, cy = vertices[faces[:, 2], :2].T
@@ -289,10 +299,10 @@ def _triangulate(vertices: Floats, low: Floats, high: Floats) -> TerrainSurface:
     # each face from its lowest vertex, faces sorted: the result does not depend on Qhull's order
     first = np.argmin(faces, axis=1)
     faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-    return TerrainSurface(vertices, faces[np.lexsort(faces.T[::-1])], low, high)
+    return faces[np.lexsort(faces.T[::-1])]
 
 
-def _sample_lane(lane: Lane, width_m: float) -> Floats:
+def _sample_lane(lane: Lane, width_m: float) -> FloatArray:
     """Return points (n, 3) along the middle and both sides of a lane."""
     shape = lane.shape_m[np.insert(np.any(np.diff(lane.shape_m, axis=0) != 0, axis=1), 0, True)]
     if len(shape) < 2:
@@ -312,7 +322,7 @@ def _sample_lane(lane: Lane, width_m: float) -> Floats:
     return np.concatenate(points)
 
 
-def _thin_points(points: Floats) -> Floats:
+def _thin_points(points: FloatArray) -> FloatArray:
     """Return the mean of the lowest level of each cell, sorted by cell, rounded to 0.1 mm."""
     cell = np.floor(points[:, :2] / _CELL_M).astype(np.int64)
     order = np.lexsort((points[:, 2], cell[:, 1], cell[:, 0]))
@@ -324,11 +334,10 @@ def _thin_points(points: Floats) -> Floats:
     number = number[is_lowest_level]
     count = np.bincount(number)
     means = [np.bincount(number, weights=points[is_lowest_level, axis]) / count for axis in range(3)]
-    thinned: Floats = np.asarray(np.round(np.column_stack(means), 4) + 0.0, dtype=np.float64)
-    return thinned
+    return np.asarray(np.round(np.column_stack(means), 4) + 0.0, dtype=np.float64)
 
 
-def _rim(low: Floats, high: Floats) -> Floats:
+def _rim(low: FloatArray, high: FloatArray) -> FloatArray:
     """Return points (n, 2) along the sides of a rectangle."""
     steps = np.minimum(np.ceil((high - low) / _RIM_STEP_M), _MAX_RIM_STEPS).astype(int) + 1
     xs = np.linspace(low[0], high[0], steps[0])

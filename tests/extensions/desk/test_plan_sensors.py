@@ -75,7 +75,7 @@ def test_sentences_name_the_largest_shares() -> None:
     assert plan_sensors.describe_found(found) == [
         "Vehicles that only this sensor finds: 34 % on North Street (north) approach, 20 % on East Street (east) exit "
         "and 12 % of all vehicles.",
-        "Of lanes, turns and crossings, most on North Street (north), left-turn lane (41 %).",
+        "Of other lanes, turns and crossings, most on North Street (north), left-turn lane (41 %).",
     ]
     no_vehicles: tuple[LocationVisibility, ...] = ()
     for overall in (no_vehicles, (location("all", "all vehicles", 0.004),)):

@@ -14,9 +14,8 @@ import re
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.creation.map_parts import MappedMesh, Terrain
 from egvs.creation.terrain.network_heights import attribute, sample_line
 from egvs.traffic.network import LANE_WIDTH_M, Shape
@@ -84,7 +83,7 @@ def _distinct(points_m: FloatArray) -> FloatArray:
     return distinct
 
 
-def _stretches(is_high: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+def _stretches(is_high: BoolArray) -> Iterator[tuple[int, int]]:
     """Yield the first and the last point of each stretch, with one point more at each end if there is one."""
     wide = is_high.copy()
     wide[:-1] |= is_high[1:]
@@ -95,7 +94,7 @@ def _stretches(is_high: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
             yield first, after - 1
 
 
-def _slab(points_m: FloatArray, half_width_m: float) -> tuple[FloatArray, NDArray[np.int64]]:
+def _slab(points_m: FloatArray, half_width_m: float) -> tuple[FloatArray, IntArray]:
     """Return vertices (4n, 3) and faces (m, 3) of a closed slab below a line (n, 3), counter-clockwise from outside."""
     tangents = np.gradient(points_m[:, :2], axis=0)
     tangents /= np.hypot(*tangents.T)[:, None]

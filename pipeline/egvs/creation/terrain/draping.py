@@ -25,11 +25,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from egvs.core import polylines
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.core.wording import by_number, format_percent, list_first, number_of
 from egvs.creation.map_parts import Terrain
 from egvs.creation.terrain.network_heights import (
@@ -176,15 +175,17 @@ def level_difference_m(text: str, terrain: Terrain, where: object = "the road ma
     return median_m, float(np.median(np.abs(known - median_m)))
 
 
-def roads_above_others(text: str, least_m: float = 3.0) -> tuple[tuple[str, str], ...]:
+_LEVEL_DIFFERENCE_M = 3.0
+"""Difference of heights above which two roads are at different levels."""
+
+
+def roads_above_others(text: str) -> tuple[tuple[str, str], ...]:
     """Return the pairs of edges of a network with heights that cross at different levels: the upper one, the lower one.
 
     Parameters
     ----------
     text
         A network that netconvert wrote.
-    least_m
-        Difference of heights above which two roads are at different levels.
     """
     shapes = list(find_shapes(text))
     graph = _EdgeGraph.from_text(text, shapes, {})
@@ -193,7 +194,7 @@ def roads_above_others(text: str, least_m: float = 3.0) -> tuple[tuple[str, str]
     for one, other in graph.crossings(shapes):
         at = shapely.LineString(lines[one][:, :2]).intersection(shapely.LineString(lines[other][:, :2]))
         difference_m = _height_at(lines[one], at) - _height_at(lines[other], at)
-        if abs(difference_m) > least_m:
+        if abs(difference_m) > _LEVEL_DIFFERENCE_M:
             pairs.append((one, other) if difference_m > 0 else (other, one))
     return tuple(pairs)
 
@@ -209,7 +210,7 @@ class _Sample:
     """Points (n, 2) along a shape, and which of them are points of the shape."""
 
     xy_m: FloatArray
-    is_given: NDArray[np.bool_]
+    is_given: BoolArray
 
 
 def _sample(shape: ShapeText) -> _Sample:

@@ -151,8 +151,7 @@ def ground_points(terrain: Terrain, window: BaseGeometry, step_m: float) -> Floa
 
 def cross_z(one: FloatArray, other: FloatArray) -> FloatArray:
     """Return the vertical part of the vector product of vectors (n, 2 or 3)."""
-    product: FloatArray = one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
-    return product
+    return one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]
 
 
 def window_points(window: BaseGeometry) -> FloatArray:

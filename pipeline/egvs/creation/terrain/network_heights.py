@@ -14,10 +14,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.scenario.fields import parse_coordinate_m
 
 _TAG = re.compile(r"<(edge|lane|junction)\s[^>]*>")
@@ -111,7 +110,7 @@ def attribute(element: str, name: str) -> str:
     return html.unescape(match[1]) if match else ""
 
 
-def sample_line(points_m: FloatArray, step_m: float) -> tuple[FloatArray, NDArray[np.bool_]]:
+def sample_line(points_m: FloatArray, step_m: float) -> tuple[FloatArray, BoolArray]:
     """Insert points into a line so that none are farther apart than a step.
 
     Parameters

@@ -36,13 +36,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import tomlkit
-from numpy.typing import NDArray
 from tomlkit.exceptions import TOMLKitError
 
 from egvs.artefacts import parquet
 from egvs.core import files, platform, reading
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError, RunError
-from egvs.core.grid import FloatArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, Roi
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.extensions.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC_FOLDER, City, CityJunction
@@ -145,7 +144,7 @@ class TrafficRegion:
         """Return the vehicle types of which every row is needed."""
         return registry.followed_types(self.scenario, sizes)
 
-    def may_contain(self, x_m: FloatArray, y_m: FloatArray, reach_m: FloatArray) -> NDArray[np.bool_]:
+    def may_contain(self, x_m: FloatArray, y_m: FloatArray, reach_m: FloatArray) -> BoolArray:
         """Return which boxes may be partly inside.
 
         Parameters
@@ -155,7 +154,7 @@ class TrafficRegion:
         reach_m
             Largest distances from there to a corner, shape (n,).
         """
-        inside: NDArray[np.bool_] = (x_m >= self.low_x_m - reach_m) & (x_m <= self.high_x_m + reach_m)
+        inside: BoolArray = (x_m >= self.low_x_m - reach_m) & (x_m <= self.high_x_m + reach_m)
         inside &= (y_m >= self.low_y_m - reach_m) & (y_m <= self.high_y_m + reach_m)
         return inside
 

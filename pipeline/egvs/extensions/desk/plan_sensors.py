@@ -83,7 +83,7 @@ def describe_found(found: SiteBlindspots) -> list[str]:
     texts = [f"Vehicles that only this sensor finds: {join_names(shares)}."]
     parts = [part for part in found.of_kind(*_PARTS) if part.share not in {street.share for street in streets}]
     if largest := [f"{part.words} ({_share(part)})" for part in _largest(parts)]:  # an approach may be a single lane
-        texts.append(f"Of lanes, turns and crossings, most on {'; '.join(largest)}.")
+        texts.append(f"Of other lanes, turns and crossings, most on {'; '.join(largest)}.")
     return texts
 
 

@@ -631,8 +631,7 @@ class ElevationCurve:
 
     def _knots(self, elevations_deg: Sequence[float]) -> FloatArray:
         at = np.linspace(0.0, self.pieces, self.channels)
-        knots: FloatArray = np.interp(np.arange(self.pieces + 1), at, self._ascending(elevations_deg))
-        return knots
+        return np.interp(np.arange(self.pieces + 1), at, self._ascending(elevations_deg))
 
     @staticmethod
     def _ascending(elevations_deg: Sequence[float]) -> FloatArray:

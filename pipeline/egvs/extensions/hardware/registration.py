@@ -30,10 +30,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 from egvs.core.special import cosdg, sindg
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose
@@ -112,7 +111,7 @@ class Registration:
     covariance: FloatArray
     not_fixed: tuple[str, ...]
     distance_m: FloatArray
-    on_surface: NDArray[np.bool_]
+    on_surface: BoolArray
     sigma_m: float
     cost_m: float
     converged: bool
@@ -396,8 +395,7 @@ def _jackknife(along: FloatArray, curvature: FloatArray, scores: FloatArray, clu
     normals = np.add.reduceat(products, starts, axis=0)
     sums = np.add.reduceat(scores[order], starts, axis=0)
     information = np.bincount(cluster, weights=curvature).astype(np.float64)
-    covariance: FloatArray = one_step_jackknife(normals, sums) + _single_cluster_variance(normals, information)
-    return covariance
+    return one_step_jackknife(normals, sums) + _single_cluster_variance(normals, information)
 
 
 def _single_cluster_variance(normals: FloatArray, information: FloatArray) -> FloatArray:
@@ -438,7 +436,7 @@ def _larger(one: FloatArray, other: FloatArray) -> FloatArray:
     return larger
 
 
-def _clusters(points_m: FloatArray, matches: _Matches, rows: NDArray[np.bool_]) -> IntArray:
+def _clusters(points_m: FloatArray, matches: _Matches, rows: BoolArray) -> IntArray:
     """Return the number of the cluster of each point, from 0: errors within a cluster are correlated.
 
     A cluster is what a sector of 30 degrees has of the walls of one solid, which a map may have in the wrong place, or
@@ -508,11 +506,9 @@ def _pose(parameters: FloatArray) -> Pose:
     return Pose(x_m, y_m, z_m, yaw_deg, pitch_deg, roll_deg)
 
 
-def _inside(matches: _Matches, gate_m: float) -> NDArray[np.bool_]:
+def _inside(matches: _Matches, gate_m: float) -> BoolArray:
     with np.errstate(invalid="ignore"):
-        inside: NDArray[np.bool_] = (np.abs(matches.distance_m) < gate_m) & (
-            np.abs(matches.along_m) < _RANGE_GATES * gate_m
-        )
+        inside: BoolArray = (np.abs(matches.distance_m) < gate_m) & (np.abs(matches.along_m) < _RANGE_GATES * gate_m)
     return inside
 
 
@@ -530,7 +526,7 @@ def _inlier_sigma(distance_m: FloatArray) -> float:
     return min(_robust_sigma(distance_m), _OUTLIER_RATIO * fifth)
 
 
-def _design(matches: _Matches, rows: NDArray[np.bool_], parameters: FloatArray) -> FloatArray:
+def _design(matches: _Matches, rows: BoolArray, parameters: FloatArray) -> FloatArray:
     """Return the derivatives of the distances with respect to all parameters, per metre and radian, (n, 6).
 
     A small rotation about the unit axis a moves the point at the arm v by a x v; a is up for the yaw, minus the turned
@@ -548,8 +544,7 @@ def _fixed_inverse(design: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the inverse of the normal matrix in the directions that surfaces fix, (k, k)."""
     basis, _ = _fixed_directions(design, weight)
     along = design @ basis
-    inverse: FloatArray = basis @ np.linalg.inv((along * weight[:, None]).T @ along) @ basis.T
-    return inverse
+    return basis @ np.linalg.inv((along * weight[:, None]).T @ along) @ basis.T
 
 
 def _fixed_directions(design: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -234,8 +234,7 @@ def front_of(x: float, y: float, z: float, w: float) -> Vector:
 
 def yaw_of(rotations: FloatArray) -> FloatArray:
     """Return the direction of the x axis of rotations (..., 3, 3) on the ground, counter-clockwise from +x, in rad."""
-    yaw: FloatArray = np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
-    return yaw
+    return np.arctan2(rotations[..., 1, 0], rotations[..., 0, 0])
 
 
 def is_rotation(matrix: FloatArray) -> bool:

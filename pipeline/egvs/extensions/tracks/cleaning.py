@@ -20,9 +20,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.extensions.tracks.model import Tracks
 from egvs.extensions.tracks.motion import motion_yaw_rad
 from egvs.traffic.class_sizes import ClassSize
@@ -167,7 +166,7 @@ def clean_tracks(tracks: Tracks, sizes: Mapping[str, ClassSize]) -> CleanTracks:
     )  # fmt: skip
 
 
-def _report_elsewhere(tracks: Tracks, is_repeated: NDArray[np.bool_], report: CleaningReport) -> None:
+def _report_elsewhere(tracks: Tracks, is_repeated: BoolArray, report: CleaningReport) -> None:
     """Count the repeated rows that are in another place than the first row of the same track and time."""
     repeated = np.flatnonzero(is_repeated)
     kept = np.maximum.accumulate(np.where(is_repeated, 0, np.arange(tracks.n_rows)))[repeated]
@@ -258,5 +257,4 @@ def _speeds(part: IntArray, tracks: Tracks) -> FloatArray:
     after[np.diff(part, append=part.max(initial=0) + 1) != 0] -= 1
     distance_m = np.hypot(tracks.x_m[after] - tracks.x_m[before], tracks.y_m[after] - tracks.y_m[before])
     duration_s = tracks.time_s[after] - tracks.time_s[before]
-    speed_m_s: FloatArray = np.divide(distance_m, duration_s, out=np.zeros_like(distance_m), where=duration_s > 0)
-    return speed_m_s
+    return np.divide(distance_m, duration_s, out=np.zeros_like(distance_m), where=duration_s > 0)

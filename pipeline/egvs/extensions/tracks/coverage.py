@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core import reading
 from egvs.core.errors import Diagnostic, InputError
-from egvs.core.grid import FloatArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, Roi
 from egvs.core.wording import format_percent
 from egvs.extensions.tracks.cleaning import CleanTracks
 from egvs.formats.georeference import Georeference, declared_crs, geojson_coordinates
@@ -64,7 +63,7 @@ class Coverage:
     hidden_ends: int = 0
     ends: int = 0
 
-    def contains(self, xy_m: FloatArray) -> NDArray[np.bool_]:
+    def contains(self, xy_m: FloatArray) -> BoolArray:
         """Return whether points (n, 2) are inside, (n,)."""
         return _contains(self.area, xy_m)
 
@@ -165,9 +164,9 @@ def read(path: Path, world: Georeference, region: Roi, lanes_m: FloatArray) -> C
     return Coverage(area, True, _share(area, region, lanes_m), len(lanes_m) > 0)
 
 
-def _contains(area: BaseGeometry, xy_m: FloatArray) -> NDArray[np.bool_]:
+def _contains(area: BaseGeometry, xy_m: FloatArray) -> BoolArray:
     shapely.prepare(area)
-    inside: NDArray[np.bool_] = shapely.intersects_xy(area, xy_m[:, 0], xy_m[:, 1])
+    inside: BoolArray = shapely.intersects_xy(area, xy_m[:, 0], xy_m[:, 1])
     return inside
 
 

@@ -28,9 +28,8 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.extensions.tracks.matching import MatchedTracks
 
 FREE_SHARE, FREE_GAP_S, STEADY_M_S2 = 0.5, 4.0, 0.5
@@ -201,7 +200,7 @@ def free_speed_factors(matched: MatchedTracks, leaders: Leaders) -> dict[int, fl
     return factors
 
 
-def _is_steady(matched: MatchedTracks) -> NDArray[np.bool_]:
+def _is_steady(matched: MatchedTracks) -> BoolArray:
     """Return where the speed changes little from the row before to the row after, (n,)."""
     steady = np.zeros(matched.track.size, dtype=bool)
     same = matched.track[2:] == matched.track[:-2]

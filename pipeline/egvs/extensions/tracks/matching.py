@@ -154,8 +154,7 @@ def _speeds(track: IntArray, time_s: FloatArray, xy_m: FloatArray) -> FloatArray
     after = np.where(track[after] == track, after, rows)
     step_s = time_s[after] - time_s[before]
     distance_m = np.hypot(*(xy_m[after] - xy_m[before]).T)
-    speeds: FloatArray = np.divide(distance_m, step_s, out=np.zeros(track.size), where=step_s > 0)
-    return speeds
+    return np.divide(distance_m, step_s, out=np.zeros(track.size), where=step_s > 0)
 
 
 def driven_lanes(network: Network) -> tuple[tuple[DrivenLane, ...], tuple[tuple[int, ...], ...]]:

@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Protocol, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.scenario.track_columns import RoadUserClass
 
 CLASSES: tuple[str, ...] = get_args(RoadUserClass)
@@ -125,7 +124,7 @@ class Tracks:
             sources=tuple(sources),
         )
 
-    def select_tracks(self, mask: NDArray[np.bool_]) -> Tracks:
+    def select_tracks(self, mask: BoolArray) -> Tracks:
         """Return some of the tracks, (n_tracks,), with their rows and names only."""
         number = np.cumsum(mask) - 1
         rows = self.select(mask[self.track])
@@ -133,7 +132,7 @@ class Tracks:
         classes = tuple(name for name, is_selected in zip(self.classes, mask, strict=True) if is_selected)
         return replace(rows, names=names, classes=classes, track=number[rows.track])
 
-    def select(self, mask: NDArray[np.bool_] | IntArray) -> Tracks:
+    def select(self, mask: BoolArray | IntArray) -> Tracks:
         """Return some of the rows, with all names."""
         arrays = {key: getattr(self, key)[mask] for key in ("track", *_NUMBERS)}
         return Tracks(self.names, self.classes, frame=self.frame, sources=self.sources, **arrays)

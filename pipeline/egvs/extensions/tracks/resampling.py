@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core import limits
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.extensions.tracks.cleaning import CleanTracks
 
 MIN_GAP_STEPS = 1.5
@@ -50,7 +49,7 @@ class ResampledTracks:
     unknown_gaps: int
     unknown: UnknownBoxes
 
-    def select(self, mask: NDArray[np.bool_]) -> ResampledTracks:
+    def select(self, mask: BoolArray) -> ResampledTracks:
         """Return some of the boxes."""
         keys = ("frame", "track", "x_m", "y_m", "yaw_rad", "speed_m_s")
         return replace(self, **{key: getattr(self, key)[mask] for key in keys})

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core import limits, reading
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.core.wording import number_of
 from egvs.extensions.tracks import columns
 from egvs.extensions.tracks.columns import Table
@@ -114,7 +113,7 @@ def _classes(table: Table, mapping: TrackColumns) -> list[str]:
     return table.classes(mapping.type, by_text)
 
 
-def _move_to_centres(table: Table, mapping: TrackColumns, values: dict[str, FloatArray]) -> NDArray[np.bool_]:
+def _move_to_centres(table: Table, mapping: TrackColumns, values: dict[str, FloatArray]) -> BoolArray:
     """Move x_m, y_m from the front to the centre; return which rows have a heading, given or of the motion, (n,)."""
     for row in np.flatnonzero(np.isnan(values["length_m"])):
         raise table.error(int(row), str(mapping.length), "expected a length, from the front to the centre, got none")

@@ -45,9 +45,8 @@ from zlib import crc32
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from egvs.clouds.sweeps import BoolArray
 from egvs.core.errors import Diagnostic
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.core.wording import format_percent
 from egvs.extensions.validation.detection_metrics import JackknifeEstimate
 from egvs.statistics.ranks import MIN_VALUES, CoefficientKind, StandardisedValues

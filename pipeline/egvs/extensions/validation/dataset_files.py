@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.simulation import CloudSimulator, sweep_rng
-from egvs.clouds.sweeps import BoolArray
 from egvs.core import files
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.core.progress import ProgressCallback
 from egvs.core.threads import map_ordered
 from egvs.extensions.validation import detector_results, kitti
@@ -225,14 +224,12 @@ def box_corners(boxes: FloatArray) -> FloatArray:
     sin = np.sin(boxes[:, 6:7])
     x = local[..., 0] * cos - local[..., 1] * sin
     y = local[..., 0] * sin + local[..., 1] * cos
-    corners: FloatArray = np.stack([x, y, local[..., 2]], axis=-1) + boxes[:, None, :3]
-    return corners
+    return np.stack([x, y, local[..., 2]], axis=-1) + boxes[:, None, :3]
 
 
 def _rotate(matrix: FloatArray, points: FloatArray) -> FloatArray:
     """Rotate points (n, 3). Written out, because BLAS may sum in another order on another machine."""
-    rotated: FloatArray = points[:, :1] * matrix[:, 0] + points[:, 1:2] * matrix[:, 1] + points[:, 2:3] * matrix[:, 2]
-    return rotated
+    return points[:, :1] * matrix[:, 0] + points[:, 1:2] * matrix[:, 1] + points[:, 2:3] * matrix[:, 2]
 
 
 @dataclass

@@ -61,9 +61,9 @@ import numpy as np
 
 from egvs.artefacts import parquet
 from egvs.artefacts.traffic_frames import BOX_COLUMNS, TrafficFrame
-from egvs.clouds.sweeps import BoolArray, Detections
+from egvs.clouds.sweeps import Detections
 from egvs.core.errors import Diagnostic, InputError
-from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 from egvs.extensions.validation.detector_results import (
     CAR_VCLASSES,
     POINT_COUNTS_NAME,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egvs.artefacts.readers import read_scores
-from egvs.clouds.sweeps import BoolArray
+from egvs.core.grid import BoolArray
 from egvs.extensions.validation import detection_metrics, ranking_check
 from egvs.extensions.validation.correlation import MIN_POLES, CorrelationStudy, JunctionScores, MeasureValues
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS, BLOCKS, SiteDetection

@@ -29,13 +29,12 @@ from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
 from egvs.core.errors import Diagnostic, EgvsError, InputError, MissingBackendError, RunError, choose_one
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
 from egvs.effects import registry
@@ -177,7 +176,7 @@ class SiteEvidence:
 
     occupancy: Occupancy
     beams: Beams
-    returned: NDArray[np.bool_]
+    returned: BoolArray
     count_hits: Callable[[Beams], tuple[Hits, int]]
     count_points: Callable[[Beams], VisibleTargets]
     detection_probability: ReturnProbability | None = None
@@ -581,7 +580,7 @@ class _PreparedScenario:
         if self._record is None and any("vehicles" in task.score.needs for task in tasks):
             self._record = TargetRecord.read(trajectories, tpog.grid)
 
-        def score_site(scan_and_returned: tuple[SiteScan, NDArray[np.bool_]]) -> list[_NumberedRow]:
+        def score_site(scan_and_returned: tuple[SiteScan, BoolArray]) -> list[_NumberedRow]:
             scan, returned = scan_and_returned
             site = scan.site.name
             probability = ReturnProbability.of(scene, scan.beams.sensor)
@@ -618,7 +617,7 @@ def _set_occlusion(scene: Scene, is_enabled: bool) -> Scene:
     return replace(scene, effects=(*other_effects, registry.make_effect("moving_occlusion", parameters)))
 
 
-def _returned_beams(context: StageContext) -> Iterator[NDArray[np.bool_]]:
+def _returned_beams(context: StageContext) -> Iterator[BoolArray]:
     """Yield which beams of each site met something, in the order of the sites."""
     path = context.folder.scans
     with parquet.open_artefact(path, "scans") as (file, _):

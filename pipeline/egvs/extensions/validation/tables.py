@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from egvs.cli.console import NARROW, Column, console, print_sentences, print_table
-from egvs.core.errors import MissingBackendError
+from egvs.core.errors import InputError, MissingBackendError
 from egvs.core.wording import format_percent, number_of
 from egvs.extensions.validation.detection_metrics import ALL_OBJECTS
 from egvs.extensions.validation.detector_results import POINT_COUNTS_NAME
@@ -70,7 +70,7 @@ def _can_rank(name: str) -> bool:
         return True
     try:
         load_vehicle_score(name)
-    except MissingBackendError:
+    except (InputError, MissingBackendError):
         return False
     return True
 

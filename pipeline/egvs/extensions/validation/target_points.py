@@ -85,5 +85,4 @@ def list_target_points(
 def _up_m(from_centre_m: FloatArray, yaw_rad: FloatArray, pitch_rad: FloatArray) -> FloatArray:
     """Return the height of positions (k, 3) along the upward axis of boxes, whose nose is up by their pitch, (k,)."""
     forward_m = from_centre_m[:, 0] * np.cos(yaw_rad) + from_centre_m[:, 1] * np.sin(yaw_rad)
-    up_m: FloatArray = from_centre_m[:, 2] * np.cos(pitch_rad) - forward_m * np.sin(pitch_rad)
-    return up_m
+    return from_centre_m[:, 2] * np.cos(pitch_rad) - forward_m * np.sin(pitch_rad)

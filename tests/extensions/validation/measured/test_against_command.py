@@ -234,7 +234,12 @@ def test_other_rings_are_reported_and_nothing_is_fitted(folder: Path, tmp_path: 
     assert "No losses are fitted." in printed and "[sensors." not in printed
     code, printed, error = run_egvs("validate", *common, "--sensor", SENSOR)
     assert code == 0, error
-    assert "rings do not match" not in printed
+    assert "do not match" not in printed
+    code, printed, error = run_egvs("validate", *common, "--sensor", "OS1-64 BH")
+    assert code == 0, error
+    assert "The azimuths do not match: in the sweeps, the returns of a ring are 0.17" in printed
+    assert "degrees apart, those of OS1-64 BH 0.352." in printed
+    assert f"The nearest sensor of the catalogue is {SENSOR}. No losses are fitted." in printed
 
 
 def test_sensor_may_be_a_file(folder: Path, tmp_path: Path, run_egvs: Any) -> None:

@@ -447,8 +447,7 @@ def _list_direction(channel: IntArray, azimuth_deg: FloatArray, step_deg: float)
 
 def _wrap(angle_deg: FloatArray) -> FloatArray:
     """Return angles in [-180, 180)."""
-    wrapped: FloatArray = np.mod(np.asarray(angle_deg) + 180.0, 360.0) - 180.0
-    return wrapped
+    return np.mod(np.asarray(angle_deg) + 180.0, 360.0) - 180.0
 
 
 def _circular_mean(angle_deg: FloatArray, period_deg: float) -> float:
@@ -463,8 +462,7 @@ def _circular_median(angle_deg: FloatArray) -> float:
 
 def _channel_means(values: FloatArray, channel: IntArray, used: np.ndarray, channels: int) -> FloatArray:
     counts = np.bincount(channel[used], minlength=channels)
-    means: FloatArray = np.bincount(channel[used], weights=values[used], minlength=channels) / np.maximum(counts, 1)
-    return means
+    return np.bincount(channel[used], weights=values[used], minlength=channels) / np.maximum(counts, 1)
 
 
 def _robust_means(residual: FloatArray, channel: IntArray, channels: int) -> tuple[FloatArray, FloatArray]:
@@ -563,5 +561,4 @@ def _varied_ranges(ranges_m: FloatArray) -> FloatArray | None:
     if occupied[start] < 0.5 * width:
         return None
     inside = (ranges_m >= start * _TENTH_M) & (ranges_m < start * _TENTH_M + _WINDOW_M)
-    window: FloatArray = ranges_m[inside] - start * _TENTH_M
-    return window
+    return ranges_m[inside] - start * _TENTH_M

@@ -71,5 +71,4 @@ def tolerance_m(range_m: FloatArray) -> FloatArray:
 
 def points_of(range_m: FloatArray, angles: BeamAngles) -> FloatArray:
     """Return the points at these ranges of all pulses, (channels, azimuths, 3), in the sensor's frame."""
-    points: FloatArray = angles.origins_m() + angles.directions() * range_m[..., None]
-    return points
+    return angles.origins_m() + angles.directions() * range_m[..., None]

@@ -337,8 +337,7 @@ def empty_scan_points(fit: SensorFit) -> FloatArray:
     """Return the empty scan in the sensor's frame, (n, 3)."""
     assert fit.empty_scan is not None
     points = empty_scan.points_of(fit.empty_scan.range_m, fit.angles)
-    known: FloatArray = points[np.isfinite(fit.empty_scan.range_m)]
-    return known
+    return points[np.isfinite(fit.empty_scan.range_m)]
 
 
 def upright(points_m: FloatArray, plane: GroundPlane) -> FloatArray:

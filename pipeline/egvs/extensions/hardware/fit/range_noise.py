@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.statistics.intervals import MIN_VALUES, Estimate, estimate_scale
 
 VARIANCE_FACTOR = 1.5
@@ -74,7 +73,7 @@ class RangeResiduals:
 def range_residuals(
     grids: list[FloatArray],
     is_full_circle: bool,
-    used: list[NDArray[np.bool_]] | None = None,
+    used: list[BoolArray] | None = None,
     incidence_deg: FloatArray | None = None,
 ) -> RangeResiduals:
     """Return the residuals of all returns with two neighbours on the same surface.

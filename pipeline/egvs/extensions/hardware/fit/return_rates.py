@@ -22,9 +22,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.extensions.hardware.fit.beam_angles import BeamAngles
 from egvs.extensions.hardware.fit.range_noise import MAX_SLOPE
 from egvs.extensions.hardware.fit.surface_normals import incidence_angles_deg
@@ -100,12 +99,11 @@ class PlaneView:
 
     range_m: FloatArray
     incidence_deg: FloatArray
-    on_road: NDArray[np.bool_]
+    on_road: BoolArray
 
     def height_m(self, range_m: FloatArray) -> FloatArray:
         """Height of returns at these ranges above the plane."""
-        height: FloatArray = (self.range_m - range_m) * np.cos(np.radians(self.incidence_deg))
-        return height
+        return (self.range_m - range_m) * np.cos(np.radians(self.incidence_deg))
 
 
 def view_of_plane(
@@ -194,7 +192,7 @@ def rates_towards_road(grids: list[FloatArray], view: PlaneView) -> list[RateBin
 _NOTHING, _ROAD, _OTHER = 0, 1, 2
 
 
-def _road_pulses(grid: FloatArray, angles: BeamAngles, view: PlaneView) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _road_pulses(grid: FloatArray, angles: BeamAngles, view: PlaneView) -> tuple[BoolArray, BoolArray]:
     """Return which pulses returned from the road, and which count."""
     with np.errstate(invalid="ignore"):
         is_road = np.abs(view.height_m(grid)) <= ROAD_BAND_M
@@ -228,7 +226,7 @@ class SmoothPulses:
 
     range_m: FloatArray
     incidence_deg: FloatArray
-    returned: NDArray[np.bool_]
+    returned: BoolArray
 
 
 def smooth_pulses(grids: list[FloatArray], angles: BeamAngles) -> SmoothPulses:
@@ -263,7 +261,7 @@ def smooth_rates(pulses: SmoothPulses) -> tuple[Estimate | None, list[RateBin]]:
     return everything, bins
 
 
-def _rate(returned: NDArray[np.bool_]) -> Estimate:
+def _rate(returned: BoolArray) -> Estimate:
     share = float(np.mean(returned))
     return estimate_share(returned.astype(np.float64), 1.0 + 2.0 * share * (1.0 - share))
 

@@ -270,8 +270,7 @@ def find_rings(points_m: FloatArray, where: str) -> Layout:
 
 def axis_distances_m(points_m: FloatArray) -> FloatArray:
     """Return the horizontal distances of points (n, 3) from the axis of rotation, at least 1 mm."""
-    distance: FloatArray = np.maximum(np.hypot(points_m[:, 0], points_m[:, 1]), 0.001)
-    return distance
+    return np.maximum(np.hypot(points_m[:, 0], points_m[:, 1]), 0.001)
 
 
 def _check_ring_count(rings: int, where: str) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from egvs.artefacts.command_results import read_results
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
-from egvs.core.grid import FloatArray
+from egvs.core.grid import FloatArray, IntArray
 from egvs.drawing import colours, pages
 from egvs.drawing.colours import IndexedImage
 from egvs.drawing.svg_figures import ColourBar, svg_start_tag
@@ -194,13 +194,12 @@ def beam_categories(comparison: ScanComparison) -> NDArray[np.uint8]:
     return category
 
 
-def _nearest_in_cell(cell: NDArray[np.int64], ranges_m: FloatArray, shape: tuple[int, int]) -> FloatArray:
+def _nearest_in_cell(cell: IntArray, ranges_m: FloatArray, shape: tuple[int, int]) -> FloatArray:
     """Return the smallest range above 0 in each cell, 0 without one."""
     nearest = np.full(shape[0] * shape[1], np.inf)
     some = ranges_m > 0
     np.minimum.at(nearest, cell[some], ranges_m[some])
-    filled: FloatArray = np.where(np.isfinite(nearest), nearest, 0.0).reshape(shape)
-    return filled
+    return np.where(np.isfinite(nearest), nearest, 0.0).reshape(shape)
 
 
 def _frame(image: IndexedImage, palettes: dict[str, bytes], ends_deg: tuple[float, float], alt: str) -> str:

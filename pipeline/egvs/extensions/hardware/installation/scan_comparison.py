@@ -18,11 +18,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import KDTree
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.extensions.hardware.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
@@ -30,8 +29,6 @@ from egvs.sensors.sites import Pose
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster
 from egvs.world.supports import without_solids
-
-Bools = NDArray[np.bool_]
 
 NEAR_M = 1.5
 """No vehicle comes closer to a sensor on a pole than this."""
@@ -94,8 +91,7 @@ class StaticWorld:
         """
         turned = np.ascontiguousarray(directions @ rotation_world_sensor(*pose.angles_deg).T)
         scan = self._caster.sweep(pose.position_m, turned, range_m)
-        ranges: FloatArray = np.where(scan.returned, np.linalg.norm(scan.ends_m, axis=1), np.inf)
-        return ranges
+        return np.where(scan.returned, np.linalg.norm(scan.ends_m, axis=1), np.inf)
 
     def heights_m(self, points_m: FloatArray) -> FloatArray:
         """Return the heights of points (n, 3) of the world frame above the ground, (n,) float64."""
@@ -298,13 +294,13 @@ def compare_scans(
     )
 
 
-def _persistent(far_nearer: Bools, beam: IntArray, scan: IntArray, n_scans: int, n_beams: int) -> Bools:
+def _persistent(far_nearer: BoolArray, beam: IntArray, scan: IntArray, n_scans: int, n_beams: int) -> BoolArray:
     """Return which beams are stopped in nearly all of at least :data:`PERSISTENT_SCANS` scans, (beams,)."""
     if n_scans < PERSISTENT_SCANS:
         return np.zeros(n_beams, dtype=np.bool_)
     stopped = np.zeros((n_scans, n_beams), dtype=np.bool_)
     stopped[scan[far_nearer], beam[far_nearer]] = True
-    persistent: Bools = stopped.mean(axis=0) >= PERSISTENT_SHARE
+    persistent: BoolArray = stopped.mean(axis=0) >= PERSISTENT_SHARE
     return persistent
 
 
@@ -321,8 +317,8 @@ def _median_by_beam(beam: IntArray, range_m: FloatArray, n_beams: int) -> FloatA
 
 def _blocked_sectors(
     azimuth_deg: FloatArray,
-    sure: Bools,
-    returned: Bools,
+    sure: BoolArray,
+    returned: BoolArray,
     obstacle_beam: IntArray,
     obstacle_m: FloatArray,
     n_scans: int,
@@ -370,7 +366,7 @@ def _sector(
     return BlockedSector(first_deg, last_deg, bearing_deg, distance_m, elevation_deg, share)
 
 
-def _circular_runs(marked: Bools) -> list[tuple[int, int]]:
+def _circular_runs(marked: BoolArray) -> list[tuple[int, int]]:
     """Return first and last (exclusive) of each run of marked bins on a circle; a gap of one bin does not end a run.
 
     Examples
@@ -403,17 +399,15 @@ def channel_elevations_deg(sensor: Sensor) -> FloatArray:
     """
     if sensor.table is None:
         return np.asarray(sensor.elevations_deg, dtype=np.float64)
-    elevations_deg: FloatArray = np.unique(np.round(_elevations_deg(sensor.directions()), 2))
-    return elevations_deg
+    return np.unique(np.round(_elevations_deg(sensor.directions()), 2))
 
 
 def _elevations_deg(directions: FloatArray) -> FloatArray:
-    elevations_deg: FloatArray = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
-    return elevations_deg
+    return np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
 
 
 def _missing_channels(
-    sensor: Sensor, elevation_deg: FloatArray, sure: Bools, returned: Bools
+    sensor: Sensor, elevation_deg: FloatArray, sure: BoolArray, returned: BoolArray
 ) -> tuple[tuple[float, ...], int | None]:
     """Return the elevations of channels without returns, and how many could not be checked (None without channels)."""
     elevations = channel_elevations_deg(sensor)

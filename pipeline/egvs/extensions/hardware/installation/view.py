@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, Roi
 from egvs.drawing.basemap import is_vegetation
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
@@ -113,8 +113,7 @@ def render_view(
     sky = np.array(_COLOURS["sky"], dtype=np.float64)
     picture = np.tile(sky, (len(rays), 1))
     picture[hit] = colours * light[:, None] * (1.0 - fade)[:, None] + sky * fade[:, None]
-    pixels: NDArray[np.uint8] = np.clip(np.rint(picture), 0, 255).astype(np.uint8).reshape(height, width, 3)
-    return pixels
+    return np.clip(np.rint(picture), 0, 255).astype(np.uint8).reshape(height, width, 3)
 
 
 def _style(name: str, kind: str) -> str:
@@ -126,7 +125,7 @@ def _style(name: str, kind: str) -> str:
     return "building" if "building" in kind else "other"
 
 
-def _on_road(carriageway: Carriageway, xy_m: FloatArray) -> NDArray[np.bool_]:
+def _on_road(carriageway: Carriageway, xy_m: FloatArray) -> BoolArray:
     """Return which points (n, 2) lie on a lane or in a junction."""
     import shapely
 
@@ -136,5 +135,5 @@ def _on_road(carriageway: Carriageway, xy_m: FloatArray) -> NDArray[np.bool_]:
     shapes = [shapely.make_valid(shape) for shape in shapes if shapely.intersects(shape, near)]
     area = shapely.union_all(shapes)
     shapely.prepare(area)
-    inside: NDArray[np.bool_] = shapely.contains_xy(area, xy_m[:, 0], xy_m[:, 1])
+    inside: BoolArray = shapely.contains_xy(area, xy_m[:, 0], xy_m[:, 1])
     return inside

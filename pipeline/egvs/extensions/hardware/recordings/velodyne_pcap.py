@@ -145,8 +145,7 @@ def _count_firings(column: IntArray, ring: IntArray, time_s: FloatArray) -> IntA
     if np.mean(is_regular) < _MIN_REGULAR or steps.sum() > _MAX_SLOTS:
         return None
     firing = np.concatenate([[0], np.cumsum(np.maximum(steps, 1.0))]).astype(np.int64)
-    counted: IntArray = firing[index]
-    return counted
+    return firing[index]
 
 
 if __name__ == "__main__":

@@ -58,8 +58,7 @@ class ReferenceSystem(NamedTuple):
     def to_xyz(self, coordinates: FloatArray) -> FloatArray:
         """Return coordinates (n, 3) in the order x (easting, longitude), y, z, with heights in metres."""
         order = [1, 0, 2] if self.is_y_first else [0, 1, 2]
-        xyz: FloatArray = coordinates[:, order] * (1.0, 1.0, self.height_unit_m)
-        return xyz
+        return coordinates[:, order] * (1.0, 1.0, self.height_unit_m)
 
 
 def parse_srs_name(srs_name: str, where: str) -> ReferenceSystem:

@@ -58,8 +58,7 @@ class Cubic(NamedTuple):
 
     def at(self, ds: FloatArray) -> FloatArray:
         """Return the values (n,) at distances (n,) from its start."""
-        values: FloatArray = self.a + ds * (self.b + ds * (self.c + ds * self.d))
-        return values
+        return self.a + ds * (self.b + ds * (self.c + ds * self.d))
 
 
 class Link(NamedTuple):
@@ -109,8 +108,7 @@ class PlanElement:
         bend = (last - first) / self.length_m
 
         def heading(s: FloatArray) -> FloatArray:
-            angles: FloatArray = self.heading_rad + s * (first + s * bend / 2)
-            return angles
+            return self.heading_rad + s * (first + s * bend / 2)
 
         # Gauss-Legendre on pieces in which the tangent turns little
         turn = max(abs(first), abs(last)) * self.length_m
@@ -136,8 +134,7 @@ class PlanElement:
         u = np.linspace(0.0, self.length_m, 257)
         steps = np.hypot(np.diff(u), np.diff(_cubics(self.v, u)))
         along = np.concatenate([[0.0], np.cumsum(steps)])
-        parameters: FloatArray = np.interp(ds, along, u)
-        return parameters
+        return np.interp(ds, along, u)
 
 
 class RoadMark(NamedTuple):
@@ -632,11 +629,9 @@ def _integer(element: Element, key: str) -> int:
 
 def _cubics(coefficients: Sequence[float], p: FloatArray) -> FloatArray:
     a, b, c, d = coefficients
-    values: FloatArray = a + p * (b + p * (c + p * d))
-    return values
+    return a + p * (b + p * (c + p * d))
 
 
 def _slopes(coefficients: Sequence[float], p: FloatArray) -> FloatArray:
     _, b, c, d = coefficients
-    values: FloatArray = b + p * (2 * c + p * 3 * d)
-    return values
+    return b + p * (2 * c + p * 3 * d)

@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, Roi
 from egvs.creation.map_parts import SolidMap
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster, shapes_between
@@ -97,13 +96,13 @@ def unseen_shares(world: World, stations_m: FloatArray, sites_m: FloatArray, roi
     return shares
 
 
-def _is_visible(caster: Caster, roi: Roi, position_m: FloatArray, points_m: FloatArray) -> NDArray[np.bool_]:
+def _is_visible(caster: Caster, roi: Roi, position_m: FloatArray, points_m: FloatArray) -> BoolArray:
     """Return which points (n, 3) no triangle hides from a position."""
     offsets = points_m - position_m
     distances = np.sqrt((offsets**2).sum(axis=1))
     directions = offsets / np.maximum(distances, np.finfo(np.float64).tiny)[:, None]
     ranges, _ = caster.first_hits(position_m - roi.origin_m, directions)
-    visible: NDArray[np.bool_] = ranges >= distances
+    visible: BoolArray = ranges >= distances
     return visible
 
 

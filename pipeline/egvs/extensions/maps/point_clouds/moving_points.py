@@ -18,9 +18,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 
 SAME_STATION_M = 0.5
 """Scanners closer to each other than this are at one station."""
@@ -61,8 +60,7 @@ class StationScan:
 
 def tolerance_m(range_m: FloatArray) -> FloatArray:
     """Return the difference up to which ranges are equal, metres."""
-    tolerances: FloatArray = np.maximum(_TOLERANCE_M, _TOLERANCE_SHARE * range_m)
-    return tolerances
+    return np.maximum(_TOLERANCE_M, _TOLERANCE_SHARE * range_m)
 
 
 def group_by_station(scans: Sequence[StationScan]) -> list[list[int]]:
@@ -78,7 +76,7 @@ def group_by_station(scans: Sequence[StationScan]) -> list[list[int]]:
     return groups
 
 
-def not_shared(sweeps: Sequence[StationScan]) -> list[NDArray[np.bool_]]:
+def not_shared(sweeps: Sequence[StationScan]) -> list[BoolArray]:
     """Return which points of each sweep are not at the farthest range that enough sweeps share in their direction.
 
     Parameters
@@ -119,7 +117,7 @@ def _sweeps_in_reach(cell: IntArray, sweep: IntArray, range_m: FloatArray) -> In
     return counts
 
 
-def seen_through(views: Sequence[StationScan]) -> list[NDArray[np.bool_]]:
+def seen_through(views: Sequence[StationScan]) -> list[BoolArray]:
     """Return which points of each view another station saw through, while no other station confirms them.
 
     Parameters
@@ -193,7 +191,7 @@ class _RangeImage:
         surrounding = minimum_filter(nearest, size=3, mode=around)
         return cls(view.station_m, nearest, farthest, surrounding, filled, sky_limits)
 
-    def judge(self, points_m: FloatArray, own_range_m: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def judge(self, points_m: FloatArray, own_range_m: FloatArray) -> tuple[BoolArray, BoolArray]:
         """Return which points (n, 3) this station saw through, and which it confirms."""
         azimuth, elevation, range_m = _polar(points_m - self.station_m)
         cell = _cell_number(azimuth, elevation, (VIEW_CELL_DEG, VIEW_CELL_DEG))

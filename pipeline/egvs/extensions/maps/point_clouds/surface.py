@@ -25,9 +25,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
+from egvs.world.terrain import triangulate
 
 GROUND_CELL_M = 0.5
 """Ground vertices: one in each cell of this size."""
@@ -115,7 +115,7 @@ def thin_points(points_m: FloatArray, cell_m: float) -> FloatArray:
     return _means_by_cell(points_m, cells)
 
 
-def is_ground(points_m: FloatArray) -> NDArray[np.bool_]:
+def is_ground(points_m: FloatArray) -> BoolArray:
     """Return which points (n, 3) lie on the ground, (n,) bool.
 
     A point is on the ground when the lowest point of its cell survives all openings, and it is at most ``STEP_M`` above
@@ -131,7 +131,7 @@ def is_ground(points_m: FloatArray) -> NDArray[np.bool_]:
     heights[is_pit] = np.inf
     lowest = _fill_gaps(heights)
     is_low = _survives_openings(lowest - _trend(lowest)) & ~is_pit
-    on_ground: NDArray[np.bool_] = is_low[column, row] & (points_m[:, 2] <= lowest[column, row] + STEP_M)
+    on_ground: BoolArray = is_low[column, row] & (points_m[:, 2] <= lowest[column, row] + STEP_M)
     return on_ground
 
 
@@ -147,11 +147,11 @@ def _fill_gaps(heights: FloatArray) -> FloatArray:
     return filled
 
 
-def _pits(heights: FloatArray) -> NDArray[np.bool_]:
+def _pits(heights: FloatArray) -> BoolArray:
     """Return the cells that are far below all their neighbours: returns by way of a mirror, not ground."""
     from scipy.ndimage import grey_closing
 
-    deep: NDArray[np.bool_] = grey_closing(heights, size=(3, 3)) - heights > PIT_M
+    deep: BoolArray = grey_closing(heights, size=(3, 3)) - heights > PIT_M
     return deep
 
 
@@ -178,7 +178,7 @@ def _along_plane(terms: FloatArray, plane: FloatArray) -> FloatArray:
     return heights
 
 
-def _survives_openings(heights: FloatArray) -> NDArray[np.bool_]:
+def _survives_openings(heights: FloatArray) -> BoolArray:
     """Return which cells stand out by no more than ``STEP_M`` in openings with growing windows."""
     from scipy.ndimage import grey_opening
 
@@ -203,22 +203,11 @@ def _window_sizes() -> list[int]:
 
 def triangulate_ground(points_m: FloatArray) -> TriangleSurface:
     """Triangulate ground points (n, 3): Delaunay of the means in cells of ``GROUND_CELL_M``, facing up."""
-    from scipy.spatial import Delaunay
-
     cells = np.floor(points_m[:, :2] / GROUND_CELL_M).astype(np.int64)
     vertices = _rounded(_means_by_cell(points_m, cells))
     if len(vertices) < 3 or np.linalg.matrix_rank(vertices[1:, :2] - vertices[0, :2]) < 2:
         return TriangleSurface(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
-    faces = np.asarray(Delaunay(vertices[:, :2] - vertices[0, :2]).simplices, dtype=np.int64)
-    ax, ay = vertices[faces[:, 0], :2].T
-    bx, by = vertices[faces[:, 1], :2].T
-    cx, cy = vertices[faces[:, 2], :2].T
-    is_down = (bx - ax) * (cy - ay) < (by - ay) * (cx - ax)
-    faces[is_down] = faces[is_down][:, [0, 2, 1]]
-    # each face from its lowest vertex, faces sorted: the result does not depend on Qhull's order
-    first = np.argmin(faces, axis=1)
-    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-    return TriangleSurface(vertices, faces[np.lexsort(faces.T[::-1])])
+    return TriangleSurface(vertices, triangulate(vertices, vertices[0, :2]))
 
 
 def make_surfels(points_m: FloatArray) -> TriangleSurface:
@@ -271,8 +260,7 @@ def _reach(distances: FloatArray) -> FloatArray:
     """Return how far neighbours (n, k) reach to one side, (n,): not the farthest ones, which noise may have moved."""
     last = distances.shape[1] - 1
     position = max(last - SKIPPED_NEIGHBOURS, 0)
-    reach: FloatArray = np.partition(distances, position, axis=1)[:, position]
-    return reach
+    return np.partition(distances, position, axis=1)[:, position]
 
 
 def _main_directions(offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -288,8 +276,7 @@ def _main_directions(offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _with_fixed_sign(vectors: FloatArray) -> FloatArray:
     largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=1)[:, None], axis=1)
-    fixed: FloatArray = vectors * np.where(largest < 0, -1.0, 1.0)
-    return fixed
+    return vectors * np.where(largest < 0, -1.0, 1.0)
 
 
 def _means_by_cell(points_m: FloatArray, cells: IntArray) -> FloatArray:
@@ -302,10 +289,8 @@ def _means_by_cell(points_m: FloatArray, cells: IntArray) -> FloatArray:
     count = np.diff(starts, append=len(points_m))
     origin = points_m[order[starts]]  # sums of small differences keep their digits far from the world's origin
     differences = points_m[order] - np.repeat(origin, count, axis=0)
-    means: FloatArray = origin + np.add.reduceat(differences, starts, axis=0) / count[:, None]
-    return means
+    return origin + np.add.reduceat(differences, starts, axis=0) / count[:, None]
 
 
 def _rounded(points_m: FloatArray) -> FloatArray:
-    rounded: FloatArray = np.round(points_m, _DIGITS) + 0.0  # no -0
-    return rounded
+    return np.round(points_m, _DIGITS) + 0.0  # no -0

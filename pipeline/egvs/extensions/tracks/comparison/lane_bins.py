@@ -109,8 +109,7 @@ def sum_groups(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray
 
 
 def mean_groups(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
-    means: FloatArray = sum_groups(values, group, n_groups) / np.bincount(group, minlength=n_groups)[:, None]
-    return means
+    return sum_groups(values, group, n_groups) / np.bincount(group, minlength=n_groups)[:, None]
 
 
 def lane_distances(first: FloatArray, second: FloatArray, lane_of_bin: IntArray) -> FloatArray:
@@ -129,5 +128,4 @@ def lane_distances(first: FloatArray, second: FloatArray, lane_of_bin: IntArray)
         middle = (p + q) / 2.0
         terms = [np.where(part == 0.0, 0.0, part * np.log2(part / middle)) for part in (p, q)]
     divergence = sum_groups((terms[0] + terms[1]) / 2.0, lane_of_bin, n_lanes)
-    distances: FloatArray = np.sqrt(np.clip(divergence, 0.0, 1.0))
-    return distances
+    return np.sqrt(np.clip(divergence, 0.0, 1.0))

@@ -448,8 +448,7 @@ def _compare_ranks(recorded: Path, simulated: Path, progress: ProgressCallback) 
 
 
 def _in_order(replicates: SiteReplicates, names: list[str]) -> FloatArray:
-    rows: FloatArray = replicates.values[[replicates.names.index(name) for name in names]]
-    return rows
+    return replicates.values[[replicates.names.index(name) for name in names]]
 
 
 def _rank_replicates(first: FloatArray, second: FloatArray) -> FloatArray:

@@ -24,9 +24,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.core.wording import format_percent, number_of
 from egvs.extensions.tracks.new.signals import GREEN, YELLOW, GroupOfEdges, SignalRecord
 
@@ -243,7 +242,7 @@ def _axes(approaches: Sequence[Approach]) -> list[list[Approach]]:
     return axes
 
 
-def _on_lanes(approach: Approach, people: RecordedPeople) -> NDArray[np.bool_]:
+def _on_lanes(approach: Approach, people: RecordedPeople) -> BoolArray:
     """Return which positions are on the lanes of a road's arm near the junction, (n,)."""
     along = np.array([np.cos(approach.direction_rad), np.sin(approach.direction_rad)])
     across = np.array([-along[1], along[0]])

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.ndimage import grey_erosion, map_coordinates
 
-from egvs.clouds.sweeps import BoolArray, SiteView, Sweep
-from egvs.core.grid import FloatArray, Roi
+from egvs.clouds.sweeps import SiteView, Sweep
+from egvs.core.grid import BoolArray, FloatArray, Roi
 from egvs.sensors.sensor import rotation_world_sensor
 
 MARGIN_M = 0.15
@@ -88,8 +88,7 @@ def empty_scan_points(view: SiteView) -> FloatArray:
     """Return the returns of the empty scan in the world frame, (n, 3)."""
     returned = np.isfinite(view.empty_range_m)
     directions = view.sensor.directions(*view.pose.angles_deg)[returned]
-    points_m: FloatArray = np.asarray(view.pose.position_m) + directions * view.empty_range_m[returned, None]
-    return points_m
+    return np.asarray(view.pose.position_m) + directions * view.empty_range_m[returned, None]
 
 
 def _fit_ground(lowest_m: FloatArray, fallback_m: float) -> FloatArray:

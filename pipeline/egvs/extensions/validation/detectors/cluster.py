@@ -41,9 +41,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from egvs.clouds.sweeps import BoolArray, Detections, SiteView, Sweep
+from egvs.clouds.sweeps import Detections, SiteView, Sweep
 from egvs.core import files
-from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 from egvs.core.special import cosdg, sindg
 from egvs.extensions.validation.detectors import background
 from egvs.extensions.validation.detectors.background import GroundMap, empty_scan_points
@@ -655,5 +655,4 @@ def box_scores(points: IntArray, cost: FloatArray) -> FloatArray:
 
     A cost below 0, possible for a common kind, counts as 0.
     """
-    score: FloatArray = (1.0 - np.exp(-points / SCORE_POINTS)) * np.exp(-np.maximum(cost, 0.0) / SCORE_COST)
-    return score
+    return (1.0 - np.exp(-points / SCORE_POINTS)) * np.exp(-np.maximum(cost, 0.0) / SCORE_COST)

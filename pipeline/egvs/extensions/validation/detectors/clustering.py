@@ -95,8 +95,7 @@ class Clusters:
         """Height of the highest point of each cluster, (m,)."""
         if not len(self):
             return np.empty(0)
-        top_m: FloatArray = np.maximum.reduceat(self.points_m[:, 2], self.starts[:-1])
-        return top_m
+        return np.maximum.reduceat(self.points_m[:, 2], self.starts[:-1])
 
 
 def find_clusters(
@@ -142,8 +141,7 @@ def _drop_small_clusters(label: IntArray, point_counts: IntArray, min_points: in
     """Return new labels, without the clusters that have fewer points."""
     is_large = point_counts >= min_points
     new_label = np.where(is_large, np.cumsum(is_large) - 1, _NO_CLUSTER)
-    labels: IntArray = np.append(new_label, _NO_CLUSTER)[label]  # index -1, no cluster, is the last
-    return labels
+    return np.append(new_label, _NO_CLUSTER)[label]  # index -1, no cluster, is the last
 
 
 def _rows_by_cluster(label: IntArray) -> tuple[IntArray, IntArray]:
@@ -203,8 +201,7 @@ def _scale_to_reach(xy_m: FloatArray, density: Density) -> FloatArray:
     near = range_m / density.reach_m
     far = (1.0 + np.log(range_m / growth_start_m)) / density.reach_per_range
     scaled_range = np.where(range_m > growth_start_m, far, near)
-    positions: FloatArray = xy_m * (scaled_range / range_m)[:, None]
-    return positions
+    return xy_m * (scaled_range / range_m)[:, None]
 
 
 def _dbscan_class() -> Any:

@@ -37,10 +37,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from egvs.clouds.sweeps import BoolArray, Detections, SiteView, Sweep
+from egvs.clouds.sweeps import Detections, SiteView, Sweep
 from egvs.core import files
 from egvs.core.errors import InputError, MissingBackendError
-from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 from egvs.extensions.validation.detectors import background
 from egvs.extensions.validation.detectors.background import GroundMap
 from egvs.extensions.validation.detectors.base import AtOneSite, suppress_overlaps

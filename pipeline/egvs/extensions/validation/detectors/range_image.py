@@ -30,9 +30,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from egvs.clouds.sweeps import BoolArray, Detections, SiteView, Sweep
+from egvs.clouds.sweeps import Detections, SiteView, Sweep
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 from egvs.extensions.validation.detectors import background, segment_model
 from egvs.extensions.validation.detectors.background import GroundMap
 from egvs.extensions.validation.detectors.base import suppress_overlaps

@@ -22,12 +22,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.simulation import BodyCaster, VehicleMeshes, builtin_bodies
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.core.grid import BoolArray, FloatArray, Grid, IntArray
 from egvs.effects.range_limit import RangeLimit
 from egvs.effects.returns import ReturnProbability
 from egvs.extensions.validation.detectors.base import make_detector
@@ -97,7 +96,7 @@ class BoxPoints:
         """Number of boxes."""
         return len(self.names)
 
-    def of_class(self, name: str) -> NDArray[np.bool_]:
+    def of_class(self, name: str) -> BoolArray:
         """Return which boxes are of a class, (n,)."""
         return np.array([other == name for other in self.classes], dtype=np.bool_)
 
@@ -435,9 +434,7 @@ def point_rows(points: BoxPoints) -> list[PointsRow]:
     return rows
 
 
-def _by_range(
-    points: BoxPoints, boxes: NDArray[np.bool_]
-) -> Iterator[tuple[tuple[int, int] | tuple[None, None], NDArray[np.bool_]]]:
+def _by_range(points: BoxPoints, boxes: BoolArray) -> Iterator[tuple[tuple[int, int] | tuple[None, None], BoolArray]]:
     """Yield all of some boxes (n,), and those in each of the ranges if they are in several."""
     yield (None, None), boxes
     for from_m, to_m in RANGES_M:
@@ -447,7 +444,7 @@ def _by_range(
 
 
 def _points_row(
-    points: BoxPoints, boxes: NDArray[np.bool_], name: str, ranges_m: tuple[int, int] | tuple[None, None]
+    points: BoxPoints, boxes: BoolArray, name: str, ranges_m: tuple[int, int] | tuple[None, None]
 ) -> PointsRow:
     measured, simulated, expected = points.measured[boxes], points.simulated[boxes], points.expected[boxes]
     objects = points.object[boxes]

@@ -15,13 +15,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.simulation import BodyCaster, VehicleMeshes, builtin_bodies
 from egvs.clouds.sweeps import Detections, SiteView, Sweep
-from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.grid import BoolArray, FloatArray, IntArray, Roi
 from egvs.extensions.validation.detection_metrics import paired_overlap
 from egvs.extensions.validation.detectors.base import Detector, SiteDetector
 from egvs.extensions.validation.measured.ratios import Ratio, ratio_of_sums
@@ -85,8 +84,8 @@ class DetectionRow:
 class Found:
     """Which boxes of all sweeps a detector finds, and has a box near, (n,) bool each."""
 
-    fits: NDArray[np.bool_]
-    nearby: NDArray[np.bool_]
+    fits: BoolArray
+    nearby: BoolArray
 
 
 def site_view(site: SensorSite) -> SiteView:
@@ -184,7 +183,7 @@ def detection_row(
     detector: str,
     group_and_ranges: tuple[str, int | None, int | None],
     found: tuple[Found, Found],
-    members: NDArray[np.bool_],
+    members: BoolArray,
     objects: IntArray,
     chances: FloatArray | None,
 ) -> DetectionRow:
@@ -208,7 +207,7 @@ def detection_row(
     measured, simulated = found
     ones = np.ones(int(members.sum()))
 
-    def share(values: NDArray[np.bool_] | FloatArray) -> Ratio:
+    def share(values: BoolArray | FloatArray) -> Ratio:
         return ratio_of_sums(values[members].astype(np.float64), ones, objects[members])
 
     auc, bins = math.nan, list[tuple[float, float]]()
@@ -235,7 +234,7 @@ def detection_row(
     )
 
 
-def area_under_curve(values: FloatArray, found: NDArray[np.bool_]) -> float:
+def area_under_curve(values: FloatArray, found: BoolArray) -> float:
     """Return the AUC of values (n,) for what was found, (n,) bool; NaN with fewer than five of either."""
     hits, misses = values[found], values[~found]
     if min(len(hits), len(misses)) < FEWEST_OF_EACH:

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.core.wording import number_of
 from egvs.extensions.validation.measured import sensor_site, yaw_conventions
 from egvs.extensions.validation.measured.comparison import (
@@ -287,13 +287,13 @@ class _Sample:
     objects: IntArray
     blocks: IntArray
     range_m: FloatArray
-    found: NDArray[np.bool_]
-    found_nearer: NDArray[np.bool_]
+    found: BoolArray
+    found_nearer: BoolArray
     by_chance: FloatArray
     points: FloatArray
     people: FloatArray
     detectors: FloatArray
-    used: NDArray[np.bool_]
+    used: BoolArray
 
 
 def _compare(
@@ -412,7 +412,7 @@ def _by_chance(pairs: Sequence[PlacedPair]) -> Iterator[FloatArray]:
             yield match_boxes(pair.boxes, pair.other.classes, later.tested_boxes, classes, NEAR_M).astype(np.float64)
 
 
-def _in_labelled_area(boxes: FloatArray, objects: IntArray, tested: Sequence[FloatArray]) -> NDArray[np.bool_]:
+def _in_labelled_area(boxes: FloatArray, objects: IntArray, tested: Sequence[FloatArray]) -> BoolArray:
     """Return which boxes are at places where the tested list has boxes, or few objects ever were, (n,)."""
     have_labels = set(_places(np.concatenate(tested)))
     places = _places(boxes)
@@ -465,9 +465,8 @@ def _levels(
     return points, people, detectors
 
 
-def _members(sample: _Sample, group: str) -> NDArray[np.bool_]:
-    members: NDArray[np.bool_] = np.isin(sample.classes, GROUPS[group]) & sample.used
-    return members
+def _members(sample: _Sample, group: str) -> BoolArray:
+    return np.isin(sample.classes, GROUPS[group]) & sample.used
 
 
 def _rows_by_range(sample: _Sample) -> Iterator[AgreementRow]:
@@ -493,11 +492,11 @@ def _rows_by_points(sample: _Sample) -> Iterator[AgreementRow]:
                 yield _row(sample, group, within, low, high)
 
 
-def _row(sample: _Sample, group: str, rows: NDArray[np.bool_], low: float, high: float) -> AgreementRow:
+def _row(sample: _Sample, group: str, rows: BoolArray, low: float, high: float) -> AgreementRow:
     blocks, count = sample.blocks[rows], int(rows.sum())
     known = rows & np.isfinite(sample.by_chance)
 
-    def share(values: NDArray[np.bool_] | FloatArray) -> Ratio:
+    def share(values: BoolArray | FloatArray) -> Ratio:
         return ratio_of_sums(values[rows].astype(np.float64), np.ones(count), blocks)
 
     simulated = bool(np.isfinite(sample.people[rows]).all())
@@ -529,7 +528,7 @@ def _score_rows(pairs: Sequence[PlacedPair], sample: _Sample) -> Iterator[ScoreR
             scores = pair.tested.scores
             chosen.append(np.zeros(0, dtype=np.bool_) if scores is None else scores >= score)
 
-        def share(within_m: float, chosen: Sequence[NDArray[np.bool_]] = chosen) -> Ratio:
+        def share(within_m: float, chosen: Sequence[BoolArray] = chosen) -> Ratio:
             found = np.concatenate([pair.matched(within_m, rows) for pair, rows in zip(pairs, chosen, strict=True)])
             return ratio_of_sums(found[cars].astype(np.float64), np.ones(int(cars.sum())), sample.blocks[cars])
 

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import BoolArray, FloatArray
 from egvs.core.wording import list_first, number_of
 from egvs.extensions.validation.measured.comparison import GROUPS
 from egvs.extensions.validation.measured.list_poses import SAME, PlanPose, are_near, find_pose
@@ -131,11 +130,11 @@ class PlacedPair:
     boxes: FloatArray
     tested_boxes: FloatArray
 
-    def matched(self, within_m: float, tested: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+    def matched(self, within_m: float, tested: BoolArray | None = None) -> BoolArray:
         """Return which boxes of the other list have a tested one nearby, (n,); ``tested`` chooses some of those."""
         return match_boxes(self.boxes, self.other.classes, self.tested_boxes, self.tested.classes, within_m, tested)
 
-    def alone(self, within_m: float) -> NDArray[np.bool_]:
+    def alone(self, within_m: float) -> BoolArray:
         """Return which tested boxes have none of the other list nearby, (m,)."""
         return ~match_boxes(self.tested_boxes, self.tested.classes, self.boxes, self.other.classes, within_m)
 
@@ -155,8 +154,8 @@ def match_boxes(
     others: FloatArray,
     other_classes: Sequence[str],
     within_m: float,
-    chosen: NDArray[np.bool_] | None = None,
-) -> NDArray[np.bool_]:
+    chosen: BoolArray | None = None,
+) -> BoolArray:
     """Return which boxes have one of the other boxes of their kind, or of no kind, within a distance, (n,)."""
     found = np.zeros(len(boxes), dtype=np.bool_)
     kinds, other_kinds = np.array([_kind(cls) for cls in classes]), np.array([_kind(cls) for cls in other_classes])

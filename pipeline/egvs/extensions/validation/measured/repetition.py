@@ -28,12 +28,11 @@ from dataclasses import dataclass
 from itertools import pairwise, permutations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from egvs.clouds.simulation import REFLECTIVITY
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.core.special import ndtr
 from egvs.core.wording import format_percent
 from egvs.extensions.validation.measured.return_fit import LIMITS_M, is_tried, minima_of_limit
@@ -152,9 +151,7 @@ def measure_repetition(site: SensorSite, sweeps: Sequence[Sweep]) -> Repetition:
     return Repetition(site, names, tuple(rows), _fit_ground(site, points, repeated))
 
 
-def repeated_returns(
-    first_m: FloatArray, second_m: FloatArray, tolerance_deg: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def repeated_returns(first_m: FloatArray, second_m: FloatArray, tolerance_deg: float) -> tuple[BoolArray, BoolArray]:
     """Return which returns of a sweep (n, 3) are static as far as another sweep (m, 3) says, and which repeat, (n,)."""
     range_m, other_m = np.sqrt((first_m**2).sum(axis=1)), np.sqrt((second_m**2).sum(axis=1))
     tree = cKDTree(second_m / other_m[:, None])
@@ -167,7 +164,7 @@ def repeated_returns(
     return repeated | ~is_there.any(axis=1), repeated
 
 
-def _fit_ground(site: SensorSite, points_m: FloatArray, repeated: NDArray[np.bool_]) -> GroundFit | None:
+def _fit_ground(site: SensorSite, points_m: FloatArray, repeated: BoolArray) -> GroundFit | None:
     """Return the rated range by the returns of some that are from the ground; None if they do not show it."""
     up = rotation_world_sensor(*site.pose.angles_deg)[2]
     ground = np.abs(points_m @ up + site.pose.z_m) < ON_GROUND_M
@@ -187,7 +184,7 @@ def _fit_ground(site: SensorSite, points_m: FloatArray, repeated: NDArray[np.boo
     return GroundFit(math.exp(log_limit) * scale, se, len(range_m))
 
 
-def _deviances(distance_m: FloatArray, repeated: NDArray[np.bool_], sector: IntArray) -> FloatArray:
+def _deviances(distance_m: FloatArray, repeated: BoolArray, sector: IntArray) -> FloatArray:
     """Return the binomial deviance of each sector, (sectors, limits)."""
     edges = np.quantile(distance_m, np.linspace(0.0, 1.0, _BINS + 1))
     of_bin = np.clip(np.searchsorted(edges, distance_m, side="right") - 1, 0, _BINS - 1)

@@ -150,8 +150,7 @@ def _deviance(count: int, expected: FloatArray) -> FloatArray:
     """Return Poisson's deviance of a count from each expected value, of the shape of ``expected``."""
     mean = np.maximum(expected, _FEW)
     logarithm = count * np.log(count / mean) if count else 0.0
-    deviance: FloatArray = 2.0 * (logarithm - (count - mean))
-    return deviance
+    return 2.0 * (logarithm - (count - mean))
 
 
 def _minima(

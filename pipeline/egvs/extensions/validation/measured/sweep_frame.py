@@ -39,6 +39,9 @@ _FEWEST_OF_RING = 20
 _SHARE_ON_RINGS = 0.8
 _RING_COUNT_TOLERANCE = 0.15
 _BEYOND_DEG = 1.5
+_STEP_RATIO = 1.5
+_STEP_QUANTILE = 0.25
+_SAME_AZIMUTH_DEG = 0.01  # a second return
 
 
 def find_frame(site: SensorSite, sweeps: Sequence[Sweep]) -> SensorSite:
@@ -126,37 +129,65 @@ def stand_upright(site: SensorSite, pairs: SweepPairs) -> tuple[SensorSite, Swee
 def in_sensor_frame(site: SensorSite, points_m: FloatArray) -> FloatArray:
     """Return points (n, 3) of the frame of the sweeps in that of the sensor."""
     to_world = rotation_world_sensor(*site.frame_pose.angles_deg)
-    points: FloatArray = points_m @ to_world.T @ rotation_world_sensor(*site.pose.angles_deg)
-    return points
+    return points_m @ to_world.T @ rotation_world_sensor(*site.pose.angles_deg)
 
 
 def describe_other_rings(site: SensorSite, sweeps: Sequence[Sweep]) -> str | None:
     """Return a sentence where the rings of sweeps are not those of the sensor; None where they are, or are not clear.
 
     Rings towards the sky may have no returns, so only those between the lowest and the highest ring with returns are
-    counted.
+    counted. The returns of a ring are as far apart as the sensor's azimuths.
     """
     sensor = site.sensor
-    elevations_deg = ring_elevations_deg([in_sensor_frame(site, sweep.points_m) for sweep in sweeps], sweeps)
-    if sensor.channels < 2 or len(elevations_deg) < 2 or _fits(sensor, elevations_deg):
+    points_m = [in_sensor_frame(site, sweep.points_m) for sweep in sweeps]
+    elevations_deg = ring_elevations_deg(points_m, sweeps)
+    if sensor.channels < 2 or len(elevations_deg) < 2:
         return None
-    low_deg, high_deg = sensor.elevation_span_deg
-    text = (
-        f"The rings do not match: the sweeps have {len(elevations_deg)} from {elevations_deg[0]:.2f} to "
-        f"{elevations_deg[-1]:.2f} degrees, {sensor.name} has {len(_within(sensor, elevations_deg))} there, of "
-        f"{sensor.channels} from {low_deg:.2f} to {high_deg:.2f}."
-    )
+    step_deg, own_step_deg = _azimuth_step_deg(sensor, points_m), sensor.azimuth_step_deg
+    if not _fits(sensor, elevations_deg):
+        low_deg, high_deg = sensor.elevation_span_deg
+        text = (
+            f"The rings do not match: the sweeps have {len(elevations_deg)} from {elevations_deg[0]:.2f} to "
+            f"{elevations_deg[-1]:.2f} degrees, {sensor.name} has {len(_within(sensor, elevations_deg))} there, of "
+            f"{sensor.channels} from {low_deg:.2f} to {high_deg:.2f}."
+        )
+    elif step_deg and own_step_deg and not 1.0 / _STEP_RATIO < step_deg / own_step_deg < _STEP_RATIO:
+        text = (
+            f"The azimuths do not match: in the sweeps, the returns of a ring are {step_deg:.3f} degrees apart, those "
+            f"of {sensor.name} {own_step_deg:.3f}."
+        )
+    else:
+        return None
     fitting = [other for other in CATALOGUE.values() if other.channels > 1 and _fits(other, elevations_deg)]
     if not fitting:
         return f"{text} No sensor of the catalogue has such rings: egvs sensor fit makes one of sweeps."
-    step_deg = sensor.azimuth_step_deg or 0.0
+    aim_deg = step_deg or own_step_deg or 0.0
     nearest = min(
         fitting,
         key=lambda other: (
-            round(_offset_deg(other, elevations_deg), 2), abs((other.azimuth_step_deg or 0.0) - step_deg)
+            round(_offset_deg(other, elevations_deg), 2), abs((other.azimuth_step_deg or 0.0) - aim_deg)
         ),
     )  # fmt: skip
     return f"{text} The nearest sensor of the catalogue is {nearest.name}."
+
+
+def _azimuth_step_deg(sensor: Sensor, points_m: Sequence[FloatArray]) -> float | None:
+    """Return how far apart neighbouring returns of a ring of the sensor are; None without any.
+
+    Most returns have their next azimuth, too: of all distances, a low quantile stands for it.
+    """
+    own_deg = np.sort(np.asarray(sensor.elevations_deg))
+    apart_deg = []
+    for points in points_m:
+        range_m = np.sqrt((points**2).sum(axis=1))
+        far, range_m = points[range_m > _NEAR_M], range_m[range_m > _NEAR_M]
+        ring = np.searchsorted(0.5 * (own_deg[1:] + own_deg[:-1]), np.degrees(np.arcsin(far[:, 2] / range_m)))
+        azimuth_deg = np.degrees(np.arctan2(far[:, 1], far[:, 0]))
+        order = np.lexsort((azimuth_deg, ring))
+        apart = np.diff(azimuth_deg[order])[np.diff(ring[order]) == 0]
+        apart_deg.append(apart[apart > _SAME_AZIMUTH_DEG])
+    all_deg = np.concatenate(apart_deg)
+    return float(np.quantile(all_deg, _STEP_QUANTILE)) if len(all_deg) else None
 
 
 def ring_elevations_deg(points_m: Sequence[FloatArray], sweeps: Sequence[Sweep]) -> FloatArray:

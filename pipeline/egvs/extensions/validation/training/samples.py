@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.clouds.simulation import CloudSimulator
-from egvs.clouds.sweeps import BoolArray
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, IntArray
+from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.extensions.validation.detectors import pointpillars
 from egvs.extensions.validation.detectors.pointpillars import (
     OUTPUT_CELL_M,
