@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import cycle
+from itertools import chain, cycle
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -57,7 +57,10 @@ def write_poles(folder: Path, number: int) -> None:
         writer = csv.DictWriter(file, rows[0], lineterminator="\n")
         writer.writeheader()
         for count, row in zip(range(number), cycle(rows), strict=False):
-            x_m, y_m = (round(float(row[key]) + rng.uniform(-1.0, 1.0), 2) for key in ("x_m", "y_m"))
+            x_m, y_m = (
+                round(float(row[key]) + rng.uniform(-reach_m, reach_m), 2)
+                for key, reach_m in (("x_m", 4.0), ("y_m", 1.0))
+            )
             writer.writerow({**row, "site": f"p{count:03}", "x_m": x_m, "y_m": y_m, "z_m": 4})
 
 
@@ -86,28 +89,31 @@ def first_answer_s(folder: Path) -> float:
 
 def memory_mb(pid: int) -> float:
     """Return the memory of a process and its children; pages that several share count once."""
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="utf-8").split()
     rows = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="utf-8").splitlines()
     pss = next(int(row.split()[1]) for row in rows if row.startswith("Pss:"))
-    return pss / 1000 + sum(memory_mb(int(child)) for child in children)
+    children = [path.read_text(encoding="utf-8").split() for path in Path(f"/proc/{pid}/task").glob("*/children")]
+    return pss / 1000 + sum(memory_mb(int(child)) for child in chain.from_iterable(children))
 
 
 def scenario_mb(run: Path) -> float:
     """Return the memory of a process that scores sites of the run."""
     code = (
-        "import os, sys, egvs; from benchmarks.desk import memory_mb\n"
-        "session = egvs.open_session(sys.argv[1])\n"
-        "session.rate('p000', egvs.Pose(x_m=190, y_m=256, z_m=4, yaw_deg=0))\n"
-        "print(memory_mb(os.getpid()))"
+        "import sys, egvs; session = egvs.open_session(sys.argv[1])\n"
+        "session.rate('p000', egvs.Pose(x_m=190, y_m=256, z_m=4, yaw_deg=0)); print(flush=True); input()"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(run)], capture_output=True, text=True, check=True)
-    return float(done.stdout)
+    command = [sys.executable, "-c", code, str(run)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        memory = memory_mb(process.pid)
+        process.kill()
+    return memory
 
 
 def open_scenario(tab: Any, name: str) -> None:
-    """Open a scenario on the start page, and take hold of its first pole."""
+    """Open a scenario on the start page, and take hold of the pole that is drawn above all others."""
     tab.get_by_title(f"Open {name}").click()
-    pole = tab.locator('.item[data-id="p000"] .body')
+    pole = tab.locator(".item.pole .body").last
     pole.wait_for()
     tab.wait_for_timeout(2000)
     tab.evaluate(WATCH)
@@ -119,7 +125,7 @@ def open_scenario(tab: Any, name: str) -> None:
 def drag(tab: Any, moves: int, pause_ms: float) -> dict[str, list[float]]:
     """Move the pole along a circle of 6 pixels; returns milliseconds of moves and scores."""
     tab.evaluate("Object.assign(shown, { moves: [], scores: [] })")
-    box = tab.locator('.item[data-id="p000"] .body').bounding_box()
+    box = tab.locator(".item.pole .body").last.bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     for angle in np.linspace(0.0, 2.0 * np.pi, moves):
         tab.mouse.move(x + 6.0 * np.sin(angle), y + 6.0 - 6.0 * np.cos(angle))
@@ -132,14 +138,15 @@ def drag(tab: Any, moves: int, pause_ms: float) -> dict[str, list[float]]:
 @contextmanager
 def opened(folder: Path) -> Iterator[tuple[subprocess.Popen[str], Any, float]]:
     """Serve a folder and open it in a browser; yields the server, the tab, and the seconds until it can be clicked."""
-    begin = time.perf_counter()
-    with server(folder) as (process, address), sync_playwright() as playwright:
+    with sync_playwright() as playwright:
         path = shutil.which("chromium") or shutil.which("chromium-browser")
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
         tab = browser.new_page(viewport={"width": 1280, "height": 800})
-        tab.goto(address)
-        tab.get_by_title("Open plain").wait_for()
-        yield process, tab, time.perf_counter() - begin
+        begin = time.perf_counter()
+        with server(folder) as (process, address):
+            tab.goto(address)
+            tab.get_by_title("Open plain").wait_for()
+            yield process, tab, time.perf_counter() - begin
         browser.close()
 
 
@@ -152,7 +159,7 @@ def measure(folder: Path, moves: int) -> Iterator[tuple[str, list[float]]]:
         yield "move shown without scores, ms", drag(tab, moves, 30.0)["moves"]
     with opened(folder) as (process, tab, _):
         open_scenario(tab, "shinjuku")
-        drag(tab, 2, 0.0)  # reads the run
+        drag(tab, 3, 0.0)  # reads the run
         tab.locator(".bubble", has_text=", rank ").wait_for(timeout=120_000)
         found = drag(tab, moves, 400.0)
         yield "move shown with scores, ms", found["moves"]
@@ -171,8 +178,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folder = Path(temporary)
         shutil.copytree(SCENARIO, folder / "shinjuku")
         write_poles(folder / "shinjuku", options.poles)
+        toml = folder / "shinjuku" / "scenario.toml"
+        toml.write_text(toml.read_text(encoding="utf-8").replace("frames = 5000", "frames = 500"), encoding="utf-8")
         shutil.copytree(folder / "shinjuku", folder / "plain")
-        egvs.run(egvs.load(folder / "shinjuku", ["traffic.frames=500"]), folder / "runs" / "shinjuku")
+        egvs.run(egvs.load(folder / "shinjuku"), folder / "runs" / "shinjuku")
         for name, values in measure(folder, options.moves):
             median, high = np.percentile(values, [50, 95])
             print(f"{name}: {median:.3g} (95 %: {high:.3g}; {len(values)}); limit {LIMITS.get(name, '-')}", flush=True)

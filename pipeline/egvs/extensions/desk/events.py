@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 _PING_S = 15.0
+_END = ""
 _MOST_WAITING = 500
 """Events that wait for a browser; a slower one misses the oldest, and fetches the state."""
 
@@ -25,6 +26,11 @@ class Events:
             if not loop.is_closed():
                 loop.call_soon_threadsafe(_put, queue, text)
 
+    def close(self) -> None:
+        """End all streams; called in the thread of the server."""
+        for queue in self._queues:
+            _put(queue, _END)
+
     async def stream(self, first: dict[str, Any]) -> AsyncIterator[str]:
         """Yield the events for one browser; ``first`` is the content of the first one, a ``state``."""
         queue: asyncio.Queue[str] = asyncio.Queue(_MOST_WAITING)
@@ -33,9 +39,12 @@ class Events:
             yield f"event: state\ndata: {json.dumps(first)}\n\n"
             while True:
                 try:
-                    yield await asyncio.wait_for(queue.get(), _PING_S)
+                    text = await asyncio.wait_for(queue.get(), _PING_S)
                 except TimeoutError:
-                    yield ": ping\n\n"
+                    text = ": ping\n\n"
+                if text == _END:
+                    return
+                yield text
         finally:
             del self._queues[queue]
 

@@ -10,11 +10,24 @@ from pathlib import Path
 import uvicorn
 
 from egvs.extensions.desk.access import HOST, KEY_PARAMETER, KeyGuard
+from egvs.extensions.desk.events import Events
 from egvs.extensions.desk.server import Desk, make_application
 from egvs.extensions.desk.workspace import Workspace
 
 _CLOSE_S = 1
-"""Time for open connections, such as events, to end."""
+"""Time for open connections to end."""
+
+
+class _Server(uvicorn.Server):
+    """Ends the events of open pages when it stops; a connection that is cut would be reported as an error."""
+
+    def __init__(self, config: uvicorn.Config, events: Events) -> None:
+        super().__init__(config)
+        self._events = events
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._events.close()
+        await super().shutdown(sockets)
 
 
 def make_server(folder: Path, scratch: Path, port: int) -> tuple[uvicorn.Server, str, Desk]:
@@ -35,7 +48,7 @@ def make_server(folder: Path, scratch: Path, port: int) -> tuple[uvicorn.Server,
         guard, log_level="error", access_log=False, server_header=False, ws="none", proxy_headers=False,
         timeout_graceful_shutdown=_CLOSE_S,
     )  # fmt: skip
-    return uvicorn.Server(config), f"http://{HOST}:{port}/?{KEY_PARAMETER}={guard.key}", desk
+    return _Server(config, desk.events), f"http://{HOST}:{port}/?{KEY_PARAMETER}={guard.key}", desk
 
 
 def serve(folder: Path, scratch: Path, listening: socket.socket, announce: Callable[[str], None]) -> None:
