@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks import straight_road
-from benchmarks.docs_figures import bodies, effects, explorer, junctions
+from benchmarks.docs_figures import bodies, desk, effects, explorer, junctions
 from benchmarks.docs_figures.printed import DOCS, PRINTED, ROOT, SCORES, Session, pages, quotes_of
 from benchmarks.docs_figures.sessions import SESSIONS, session_of
 from egvs.core.errors import EgvsError
@@ -57,6 +57,13 @@ def _draw_explorer(folder: Path, images: Path) -> None:
     explorer.draw(folder / "runs" / "nishishinjuku", scratch, images)
 
 
+def _draw_desk(folder: Path, images: Path) -> None:
+    served = folder / "served"
+    shutil.rmtree(served, ignore_errors=True)
+    served.mkdir()
+    desk.draw(served, images)
+
+
 def _draw_straight_road(_: Path, images: Path) -> None:
     straight_road.draw_figure(images / "straight-road.png", straight_road.rows())
 
@@ -66,6 +73,7 @@ GROUPS = (
     Group("plan", junctions.PLAN_FILES, junctions.draw_plan, "nishishinjuku"),
     Group("junction", junctions.STORY_FILES, junctions.draw_story, "story"),
     Group("explorer", explorer.FILES, _draw_explorer, "nishishinjuku"),
+    Group("desk", desk.FILES, _draw_desk),
     Group("seeds", ("seeds.png",), junctions.draw_seeds),
     Group("effects", effects.FILES, effects.draw),
     Group("straight-road", ("straight-road.png",), _draw_straight_road),

@@ -76,9 +76,9 @@ def draw(run: Path, scratch: Path, images: Path) -> None:
 
 
 def _draw_page_file(page: Path, names: list[str], out: Path) -> None:
-    with _browser() as browser:
+    with browser() as opened:
         for name in names:
-            tab = browser.new_page(
+            tab = opened.new_page(
                 viewport={"width": PAGE_WIDTH, "height": PAGE_HEIGHT}, color_scheme=PAGE_FILE_PICTURES[name]
             )
             tab.set_default_timeout(300_000)
@@ -98,14 +98,15 @@ def _save(picture: Image.Image, path: Path) -> None:
 
 
 @contextmanager
-def _browser() -> Iterator[Any]:
+def browser() -> Iterator[Any]:
+    """Open Chromium."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
         chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-        browser = playwright.chromium.launch(executable_path=chromium, args=GRAPHICS)
-        yield browser
-        browser.close()
+        opened = playwright.chromium.launch(executable_path=chromium, args=GRAPHICS)
+        yield opened
+        opened.close()
 
 
 @contextmanager
@@ -115,8 +116,8 @@ def _tab(scratch: Path, run: Path) -> Iterator[tuple[Page, Any]]:
     loop = threading.Thread(target=page.run)
     loop.start()
     try:
-        with _browser() as browser:
-            tab = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        with browser() as opened:
+            tab = opened.new_page(viewport={"width": WIDTH, "height": HEIGHT})
             tab.goto(page.address)
             tab.get_by_text("rank 1 of").wait_for(timeout=120_000)
             tab.wait_for_timeout(30_000)

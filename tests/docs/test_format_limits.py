@@ -284,7 +284,7 @@ TRIALS = {
         "a.parquet", lambda path, mb: geoparquet(path, 10 + int(mb * 10_000)),  # type: ignore[arg-type,return-value]
         read_layer, {"EGVS_MAX_DOCUMENT_MB": 1, "EGVS_MAX_READER_MB": 20},
     ),
-    "GeoTIFF": Trial("a.tif", padded_geotiff, read_geotiff, CONFINED),
+    "GeoTIFF; pictures (PNG, JPEG)": Trial("a.tif", padded_geotiff, read_geotiff, CONFINED),
     "ASCII grids": Trial("a.asc", text(GRID), read_ascii_grid, {"EGVS_MAX_FILE_MB": 1, "EGVS_MAX_POINTS": 3}),
     "sweeps in .npz": Trial("a.npz", write_npz, read_npz, {"EGVS_MAX_UNPACKED_MB": 1, "EGVS_MAX_POINTS": 2999}),
     "route files": Trial("r.rou.xml", write_routes, count_demand, {"EGVS_MAX_VEHICLES": 8, "EGVS_MAX_ROUTE_EDGES": 19}),

@@ -265,6 +265,8 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
     tab.get_by_role("button", name="Find the best 2 poles").click()
     tab.get_by_role("heading", name="2 sensors").wait_for(timeout=JOB_MS)
     assert tab.locator(".item.sensor").count() == 2
+    stage, panel = (tab.locator(part).bounding_box() for part in ("#stage", "#panel"))
+    assert stage["x"] + stage["width"] <= panel["x"]  # side by side
     tab.get_by_role("button", name="Keep, to compare").click()
     tab.get_by_role("slider", name="Sensors").press("ArrowLeft")
     tab.get_by_role("heading", name="1 sensor:").wait_for(timeout=JOB_MS)

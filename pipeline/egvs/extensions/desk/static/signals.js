@@ -90,7 +90,7 @@ function diagram(signal) {
   const starts = lengths.map((/** @type {number} */ _, /** @type {number} */ number) => sum(lengths.slice(0, number)));
   const greens = (/** @type {Row} */ row) => partsOf(signal, row).filter(([kind]) => kind === "green").map(([, begin, length]) => `${readable(begin)} to ${readable(begin + length)}`);
   const text = rows.map((row) => `${row.label}: green ${greens(row).join(" and ")} s`).join("; ");
-  return s("svg.plan", { viewBox: `0 0 ${WIDTH} ${bottom + 14}`, role: "img", "aria-label": `Cycle of ${readable(cycle)} s. ${text}` },
+  return s("svg.cycle", { viewBox: `0 0 ${WIDTH} ${bottom + 14}`, role: "img", "aria-label": `Cycle of ${readable(cycle)} s. ${text}` },
     starts.map((/** @type {number} */ start, /** @type {number} */ number) => [
       s("path.begin", { d: `M${x(start)} 2V${bottom}` }), s("text.number", { x: x(start) + 4, y: 11 }, number + 1), s("text", { x: x(start), y: bottom + 12 }, readable(start)),
     ]).flat(),
