@@ -197,6 +197,7 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         desk.ok("POST", "/api/score", {"site": "pole_a", "x_m": 16, "y_m": 6, "request": 3})
         refused = next_event(events, "score")
         assert not refused["ok"] and "house" in str(refused["message"])
+        assert desk.project["run"]["state"] == "outdated"
         assert (tmp_path / "work" / "runs" / "mini" / "scores.parquet").read_bytes() == before
 
 

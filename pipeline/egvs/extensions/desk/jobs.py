@@ -189,8 +189,8 @@ class LiveScores:
         """Whether a worker has the run open, or opens it."""
         return self._process is not None and self._process.poll() is None
 
-    def request(self, run: dict[str, Any], request: dict[str, Any]) -> None:
-        """Ask for a score; an earlier request that has not begun is dropped."""
+    def request(self, run: dict[str, str], request: dict[str, Any]) -> None:
+        """Ask for a score of a run, which is opened unless one is; an earlier request that has not begun is dropped."""
         with self._changed:
             self._request = request
             if not self.is_open:

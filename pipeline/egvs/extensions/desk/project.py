@@ -364,12 +364,20 @@ class Project:
         """Changes with each change of the files."""
         return hashlib.sha256(repr(sorted(self._contents.items())).encode()).hexdigest()
 
-    def copy_files(self, target: Path) -> None:
-        """Copy the scenario, as the results of its run belong to it, whatever is changed afterwards."""
+    def copy_with_run(self, target: Path) -> dict[str, str]:
+        """Copy the scenario and its run to a folder; return both copies, ``scenario`` and ``run``.
+
+        What reads them later sees neither changes of the files nor another run, and writes to neither.
+        """
         shutil.rmtree(target, ignore_errors=True)
+        copies = {"scenario": target / self.folder.name, "run": target / RUNS / self.folder.name}
         shutil.copytree(
-            self.folder, target, ignore=lambda folder, names: [str(RUNS)] if Path(folder) == self.folder else []
+            self.folder,
+            copies["scenario"],
+            ignore=lambda folder, names: [str(RUNS)] if Path(folder) == self.folder else [],
         )
+        shutil.copytree(self.run_folder, copies["run"])
+        return {name: str(copy) for name, copy in copies.items()}
 
     def _why_no_sites(self) -> str:
         name = self._scenario.sites.file

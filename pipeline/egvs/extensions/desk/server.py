@@ -455,13 +455,10 @@ class Desk:
             self._refuse_without_scores(is_open=self._live.is_open)
             pose = {key: parse_number(body[key], key) for key in _POSE if body.get(key) not in (None, "")}
             request = {"site": require_text(body, "site"), "pose": pose, "request": body.get("request")}
-            opened = {
-                "run": str(project.run_folder),
-                "scenario": str(self.workspace.scratch / "live" / project.folder.name),
-            }
+            opened = {}
             if not self._live.is_open:
                 self._refuse_while_running()
-                project.copy_files(Path(opened["scenario"]))
+                opened = project.copy_with_run(self.workspace.scratch / "live")
             self._live.request(opened, request)
             return {}
 
