@@ -36,7 +36,8 @@ class RefusalError(Exception):
 def describe_error(error: EgvsError) -> tuple[str, str]:
     """Return the message and the hint of an error."""
     if isinstance(error, InputError):
-        return f"{error.where}: {error.problem}", error.hint.strip()
+        stop = "." if error.hint and error.problem[-1:].isalnum() else ""
+        return f"{error.where}: {error.problem}{stop}", error.hint.strip()
     return str(error), ""
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import sys
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from egvs.stages.base import StageContext
 
 _INTERVAL_S = 0.15
+_MOUNT = re.compile(r"@[^@]*(m|deg|aim)$")  # heights and tilts that a scenario tries, in the name of a candidate
 Send = Callable[[dict[str, Any]], None]
 
 
@@ -177,10 +179,14 @@ def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str,
         request["scenario"], names=[request["table"]], progress=progress.report, listener=progress.stage_event
     )
     (answer,) = result.answers
-    rows = []
+    rows, poles = [], set[str]()
     for site in result.sites:
+        pole = _MOUNT.sub("", site.site)
+        if pole in poles:  # its best mount was listed
+            continue
+        poles.add(pole)
         after = site.present[0]
-        row = {"pole": site.site, "before_text": result.label.with_unit(site.before), "after_text": "impossible"}
+        row = {"pole": pole, "before_text": result.label.with_unit(site.before), "after_text": "impossible"}
         row["change_text"] = ""
         if after is not None:
             row["after_text"] = result.label.with_unit(after)
@@ -188,7 +194,10 @@ def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str,
         if site.site == result.best.site and answer.change is not None:
             row["change_text"] = f"{format_difference(answer.change, result.best)} {difference_unit(result.best)}"
         rows.append(row)
-    return {"text": [answer.conclusion(), *result.notes], "poles": rows}
+    conclusion = answer.conclusion()
+    for site in result.sites:
+        conclusion = conclusion.replace(site.site, _MOUNT.sub("", site.site))
+    return {"text": [conclusion, *result.notes], "poles": rows}
 
 
 def run_command(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:

@@ -49,7 +49,7 @@ export function drawCounts(panel) {
   show(panel,
     h("h1", {}, "Traffic"),
     !reason
-      ? h("p.todo", {}, isAssumed ? "These numbers are assumed from the map. Type your counts at the arrows, in vehicles per hour." : "Vehicles per hour, at the arrows.")
+      ? h("p.todo", {}, isAssumed ? "Numbers that you have not typed are assumed from the map. Type your counts at the arrows, in vehicles per hour." : "Vehicles per hour, at the arrows.")
       : h("p.note", {}, reason),
     approaches.length > 0 && h("div.table", {}, h("table", {}, h("caption.unseen", {}, `Vehicles per hour by approach ${counts().period}`),
       h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "From"), h("th.n", { scope: "col" }, "Lanes"), h("th.n", { scope: "col" }, "Vehicles/h"))),

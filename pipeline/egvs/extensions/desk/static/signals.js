@@ -35,7 +35,7 @@ function signalCard(signal, bars) {
   const columns = h("div.stages", {}, signal.phases.map((/** @type {any} */ phase, /** @type {number} */ number) => h("div", {}, stage(phase), time(signal, number))));
   columns.style.gridTemplateColumns = lengthsOf(signal).map((/** @type {number} */ length) => `minmax(4.75rem, ${length}fr)`).join(" ");
   return h("section.card", {}, h("h2", {}, "Signals"),
-    h("p.quiet", {}, !/^\d+$/.test(signal.title) && `${signal.title}. `, signal.assumed && "Assumed: type the real times if you know them."),
+    h("p.quiet", {}, !/^\d+$/.test(signal.title) && `${signal.title}. `, signal.assumed && "Times that you have not typed are assumed."),
     columns, bars,
     h("div.pair", {}, time(signal, "yellow_s"), time(signal, "all_red_s")));
 }
