@@ -88,7 +88,7 @@ def describe_ranking(folder: Path) -> dict[str, Any]:
             "rank": rank, "pole": pole.name, "site": best.site, "mount_text": describe_mount(best),
             "score": _finite(best.score), "score_text": by.with_unit(best.score, se),
         })  # fmt: skip
-    return {"label": by.head, "poles": poles}
+    return {"label": by.head, "noun": by.noun, "poles": poles}
 
 
 def describe_plan(folder: Path, adds: Mapping[str, list[str]]) -> dict[str, Any] | None:

@@ -82,6 +82,8 @@ function drawRanking(ranking) {
   if (data.selected !== listed) turnTo("ranking", at);
   listed = data.selected;
   return h("section", {}, h("h2", {}, ranking.outdated ? "Ranking before the changes" : "Ranking"),
+    h("p.quiet", {}, `${capitalised(ranking.noun)} ± standard error.`),
+    h("p.quiet.colours", {}, "On the map, worse", ["q0", "q1", "q2", "q3", "q4"].map((colour) => h(`i.${colour}`)), "better"),
     pagedTable({
       key: "ranking", caption: "Poles, best first", rows: ranking.poles, redraw: () => update({ ranking }), isSelected: (pole) => siteOf(pole.pole) === data.selected,
       columns: [
