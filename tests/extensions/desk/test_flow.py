@@ -214,7 +214,9 @@ def test_mistakes_with_maps_are_explained(desk: Client) -> None:
     )
     dropped = desk.ok("POST", "/api/maps?name=bare.osm", bare)
     desk.ok("POST", "/api/new", {"map": dropped["id"], "name": "bare", "at": None, "poles": "existing"})
-    assert "no map has a street lamp" in desk.wait("failed")["message"]
+    failed = desk.wait("failed")
+    assert failed["message"].startswith("Poles of the map: no map has a street lamp")
+    assert failed["hint"] == "Choose new poles at the kerbs."
     for body, field in (
         ({"map": "m9", "name": "x"}, ""), ({"map": dropped["id"], "name": "../x"}, "name"),
         ({"map": dropped["id"], "name": "x", "at": [1]}, "at"),

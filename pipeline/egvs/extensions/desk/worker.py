@@ -85,7 +85,12 @@ def create(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
         existing_poles=request["poles"] == "existing", traffic=request["traffic"], walk=request["walk"]
     )
     at = request["at"]
-    made = create_scenario(request["folder"], request["map"], None if at is None else (at[0], at[1]), options)
+    try:
+        made = create_scenario(request["folder"], request["map"], None if at is None else (at[0], at[1]), options)
+    except InputError as error:
+        if error.where != "--poles existing":
+            raise
+        raise InputError("Poles of the map", error.problem, "Choose new poles at the kerbs.") from None
     return {"notes": list(made.notes)}
 
 
