@@ -5,7 +5,9 @@ from __future__ import annotations
 import http.client
 import io
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -13,6 +15,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -35,6 +38,18 @@ def listening(desk: Client) -> Iterator[http.client.HTTPResponse]:
         yield response
     finally:
         connection.close()
+
+
+@contextmanager
+def paused_worker() -> Iterator[None]:
+    """Pause the worker of this process."""
+    children = chain.from_iterable(path.read_text().split() for path in Path("/proc/self/task").glob("*/children"))
+    (worker,) = (pid for pid in map(int, children) if b"desk.worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    os.kill(worker, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(worker, signal.SIGCONT)
 
 
 def next_event(events: http.client.HTTPResponse, name: str) -> dict[str, object]:
@@ -128,8 +143,9 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         assert desk.refused("POST", path, {"site": "pole_a"})[0] == 409
     with listening(desk) as events:
         desk.ok("POST", "/api/run", {})
-        assert desk.refused("POST", "/api/run", {})[0] == 409
-        assert desk.refused("PATCH", "/api/sites/pole_a", {"z_m": 4})[0] == 409
+        with paused_worker():  # it cannot end meanwhile
+            assert desk.refused("POST", "/api/run", {})[0] == 409
+            assert desk.refused("PATCH", "/api/sites/pole_a", {"z_m": 4})[0] == 409
         assert desk.ok("POST", "/api/stop", {})["job"]["state"] == "stopped"
         assert next_event(events, "job")["state"] == "runs"
         assert desk.refused("POST", "/api/stop", {})[0] == 409
