@@ -423,6 +423,8 @@ def test_lists_junctions_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.
         assert f"{option}: has no effect with --list" in run_egvs("new", "--list", "--from", SMALL, option, "any")[2]
     assert "FOLDER: no folder is given" in run_egvs("new", "--from", SMALL)[2]
     assert "no map is given" in run_egvs("new", "--list")[2]
+    code, _, message = run_egvs("new", tmp_path / "place", "--from", SMALL, "--list")
+    assert (code, "place: there is no such map, and --list makes no folder" in message) == (2, True)
 
 
 def test_lists_the_nearest_junctions_of_a_point_first(

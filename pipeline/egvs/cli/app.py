@@ -807,6 +807,8 @@ def new(
         }  # fmt: skip
         for option in filter(others.get, others):
             raise InputError(option, "has no effect with --list", "Remove one of them.")
+        if maps and folder is not None and not folder.exists():
+            raise InputError(folder, "there is no such map, and --list makes no folder", "Leave the name out.")
         maps_given = [*(maps or []), *([folder] if folder else []), *(more or [])]  # --from A B takes B for the folder
         near = None if at is None else cli_options.latitude_and_longitude(at)
         _list_junctions(maps_given, NewScenarioOptions(lefthand=lefthand, righthand=righthand, walk=walk), near)

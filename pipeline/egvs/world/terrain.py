@@ -279,7 +279,7 @@ def _nearest(points: FloatArray, at: FloatArray) -> IntArray:
 
 
 def triangulate(vertices: FloatArray, origin: FloatArray) -> IntArray:
-    """Return the Delaunay triangles of points (n, 3) from above, (m, 3) int64, facing up, in an order of their own.
+    """Return the Delaunay triangles of points (n, 3) from above, (m, 3) int64, facing up, sorted.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ def middle_of_red(content: bytes, matrix: list[float]) -> list[float]:
     return [a * column + b * row + c, d * column + e * row + f]
 
 
-def test_part_around_the_junction_is_kept(town: Client, tmp_path: Path) -> None:
+def test_part_around_the_junction_is_saved(town: Client, tmp_path: Path) -> None:
     before = town.project
     picture = write_picture(tmp_path / "town.tif", *at_junction(tmp_path))
     after = town.ok("POST", "/api/aerial?name=town.tif", picture.read_bytes())["project"]

@@ -176,7 +176,8 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         desk.wait()
         compared = desk.ok("GET", "/api/what_if")
         assert not compared["outdated"] and "of the time" in compared["text"][0]
-        assert {row["pole"] for row in compared["poles"]} == {"pole_a", "pole_b"}
+        assert {row["site"].partition(",")[0] for row in compared["sites"]} == {"pole_a", "pole_b"}
+        assert re.search(r": pole_[ab], [\d.]+ m up, level (stays|becomes) the best site", compared["text"][0])
         desk.ok("PUT", "/api/obstacles", {"obstacles": []})
         assert desk.ok("GET", "/api/what_if")["outdated"]
         desk.ok("POST", "/api/plan", {"count": 1})

@@ -422,7 +422,7 @@ def test_plan_that_cannot_be_is_explained(finished: Any) -> None:
     assert_accessible(tab)
 
 
-def test_results_are_kept_until_a_change_is_agreed_to(finished: Any, folder: Path) -> None:
+def test_results_stay_until_a_change_is_confirmed(finished: Any, folder: Path) -> None:
     tab, sites = finished, folder / "mini" / "sites.csv"
     before = sites.read_text()
     tab.get_by_role("button", name="Find the best 2 poles").click()

@@ -44,7 +44,7 @@ def test_what_one_sensor_finds_is_the_sum_over_vehicles(sensors: int) -> None:
     chances = {f"s{number}": rng.uniform(0, 1, n) for number in range(sensors)}
     points = {name: np.zeros(n) for name in chances}
 
-    found = plan_sensors.found_by_one(spots, points, chances)
+    found = plan_sensors.exclusive_visibility(spots, points, chances)
     for name in chances:
         for k in range(2):
             alone = total = 0.0
@@ -72,14 +72,14 @@ def test_sentences_name_the_largest_shares() -> None:
         location("crossing", "North Street (north) crosswalk", 0.004),
     )
     found = SiteBlindspots("a", locations, np.empty((0, 0)), (0.0, 0.0), 1.0)
-    assert plan_sensors.describe_found(found) == [
+    assert plan_sensors.describe_exclusive(found) == [
         "Vehicles that only this sensor finds: 34 % on North Street (north) approach, 20 % on East Street (east) exit "
         "and 12 % of all vehicles.",
         "Of other lanes, turns and crossings, most on North Street (north), left-turn lane (41 %).",
     ]
     no_vehicles: tuple[LocationVisibility, ...] = ()
     for overall in (no_vehicles, (location("all", "all vehicles", 0.004),)):
-        (text,) = plan_sensors.describe_found(replace(found, locations=overall))
+        (text,) = plan_sensors.describe_exclusive(replace(found, locations=overall))
         assert text == "The other sensors find almost every vehicle that it finds."
 
 

@@ -91,11 +91,11 @@ class AerialPicture:
         if len(blocks) != 1:
             raise InputError(self.name, _CANNOT_READ)
         suffix = blocks[0].values["suffix"]
-        remove_picture(folder)
         with files.atomic_write(folder / f"{STEM}{suffix}") as temp_path:
             temp_path.write_bytes(blocks[0].content)
         lines = "".join(f"{value!r}\n" for value in blocks[0].values["world"])
         files.write_text(folder / f"{STEM}{_WORLD_SUFFIXES[suffix]}", lines)
+        remove_picture(folder, except_suffix=suffix)
 
     def _world_transform(self) -> list[float]:
         if not self.world_file:
@@ -131,10 +131,12 @@ def describe_picture(folder: Path) -> dict[str, Any] | None:
     return {"key": str(path.stat().st_mtime_ns), "matrix": [a, d, b, e, c - (a + b) / 2, f - (d + e) / 2]}
 
 
-def remove_picture(folder: Path) -> None:
-    """Remove the picture in a folder, if there is one."""
-    for suffix in (*_WORLD_SUFFIXES, *_WORLD_SUFFIXES.values()):
-        (folder / f"{STEM}{suffix}").unlink(missing_ok=True)
+def remove_picture(folder: Path, except_suffix: str = "") -> None:
+    """Remove the pictures in a folder with their world files, except one of a suffix."""
+    for picture, world in _WORLD_SUFFIXES.items():
+        if picture != except_suffix:
+            (folder / f"{STEM}{picture}").unlink(missing_ok=True)
+            (folder / f"{STEM}{world}").unlink(missing_ok=True)
 
 
 # --- in the other process ---

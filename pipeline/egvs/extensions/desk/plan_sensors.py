@@ -30,7 +30,7 @@ _LEAST_SHARE = 0.005
 """A smaller share is written as 0 %."""
 
 
-def found_by_one(
+def exclusive_visibility(
     spots: VehicleSpots, points: Mapping[str, FloatArray], chances: Mapping[str, FloatArray]
 ) -> dict[str, SpotVisibility]:
     """Return what each sensor finds at each spot that no other one does; detections are independent.
@@ -69,12 +69,12 @@ def describe_additions(context: StageContext, plan: SensorPlan) -> dict[str, lis
     for name, beams in plan_beams(context, mounts, moved=plan.refinement is not None):
         visible = targets.visible(beams)
         points[name], chances[name] = visible.points, detection_probabilities(visible, targets.detectors)
-    found = found_by_one(targets.spots, points, chances)
-    return {name: describe_found(site_blindspots(name, targets.spots, one, grid)) for name, one in found.items()}
+    found = exclusive_visibility(targets.spots, points, chances)
+    return {name: describe_exclusive(site_blindspots(name, targets.spots, one, grid)) for name, one in found.items()}
 
 
-def describe_found(found: SiteBlindspots) -> list[str]:
-    """Return where a sensor finds what no other one does (:func:`found_by_one`): streets, then their parts."""
+def describe_exclusive(found: SiteBlindspots) -> list[str]:
+    """Return where a sensor finds what no other one does (:func:`exclusive_visibility`): streets, then their parts."""
     if found.overall is None or found.overall.share < _LEAST_SHARE:
         return ["The other sensors find almost every vehicle that it finds."]
     streets = _largest(found.of_kind(*_STREETS))

@@ -26,7 +26,7 @@ _NO_SCORES = ("placement", "costs", "what_if")
 
 
 MOST_SENSORS = 12
-"""Sensors of the dearest plan that a budget is offered for."""
+"""Sensors of the largest plan that the page offers."""
 
 
 def describe_run(folder: Path, scenario: Scenario) -> dict[str, Any]:
@@ -64,7 +64,10 @@ def _placement_rules(placement: Mapping[str, Any]) -> dict[str, Any]:
 def describe_costs(scenario: Scenario, candidates: Sequence[Site]) -> dict[str, Any]:
     """Return what is paid for poles and sensors, and for the cheapest and the dearest plan; None where unknown."""
     sensor_costs = {site.sensor: scenario.costs.sensor.get(site.sensor) for site in candidates}
-    costs = {"pole_cost": scenario.costs.pole, "sensor_costs": sensor_costs, "least": None, "most": None}
+    costs = {
+        "pole_cost": scenario.costs.pole, "sensor_costs": sensor_costs, "least": None, "most": None,
+        "most_sensors": MOST_SENSORS,
+    }  # fmt: skip
     try:
         rules = problem_builder.rules_from_config(scenario, candidates)
     except InputError:  # such as a cost that is not given

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import signal
 import sys
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from egvs.stages.base import StageContext
 
 _INTERVAL_S = 0.15
-_MOUNT = re.compile(r"@[^@]*(m|deg|aim)$")  # heights and tilts that a scenario tries, in the name of a candidate
 Send = Callable[[dict[str, Any]], None]
 
 
@@ -177,6 +175,10 @@ def _open_plan(request: dict[str, Any], settings: Sequence[str] = ()) -> Iterato
 
 def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
     """Compare the ranking with that with obstacles, as ``egvs what-if``."""
+    from dataclasses import replace
+
+    from egvs.artefacts.run_folder import RunFolder
+    from egvs.results.ranking import Ranking, site_titles
     from egvs.results.sensors import difference_unit, format_difference
     from egvs.studies.what_if import what_if
 
@@ -184,14 +186,15 @@ def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str,
         request["scenario"], names=[request["table"]], progress=progress.report, listener=progress.stage_event
     )
     (answer,) = result.answers
-    rows, poles = [], set[str]()
+    titles = site_titles(Ranking.read(RunFolder(result.runs[0].folder).scores).sites)
+    rows = []
     for site in result.sites:
-        pole = _MOUNT.sub("", site.site)
-        if pole in poles:  # its best mount was listed
-            continue
-        poles.add(pole)
         after = site.present[0]
-        row = {"pole": pole, "before_text": result.label.with_unit(site.before), "after_text": "impossible"}
+        row = {
+            "site": titles[site.site],
+            "before_text": result.label.with_unit(site.before),
+            "after_text": "impossible",
+        }
         row["change_text"] = ""
         if after is not None:
             row["after_text"] = result.label.with_unit(after)
@@ -199,10 +202,11 @@ def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str,
         if site.site == result.best.site and answer.change is not None:
             row["change_text"] = f"{format_difference(answer.change, result.best)} {difference_unit(result.best)}"
         rows.append(row)
-    conclusion = answer.conclusion()
-    for site in result.sites:
-        conclusion = conclusion.replace(site.site, _MOUNT.sub("", site.site))
-    return {"text": [conclusion, *result.notes], "poles": rows}
+    answer = replace(
+        answer, best_before=titles[answer.best_before], best_expected=titles[answer.best_expected],
+        rival=titles.get(answer.rival, ""),
+    )  # fmt: skip
+    return {"text": [answer.conclusion(), *result.notes], "sites": rows}
 
 
 def run_command(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:

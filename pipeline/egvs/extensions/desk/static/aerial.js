@@ -7,7 +7,6 @@ import { readable } from "./numbers.js";
 import { attempt, change, data, say, update } from "./store.js";
 
 const KINDS = [".tif", ".tiff", ".png", ".jpg", ".jpeg"];
-const IS_PICTURE = /\.(tiff?|png|jpe?g)$/i;
 const IS_WORLD = /\.(wld|\w{1,4}w)$/i;
 const IS_SYSTEM = /\.prj$/i;
 const MOST_CHARACTERS = 4000;
@@ -37,7 +36,7 @@ export function refuseLarge(file, start) {
 
 /** @param {File[]} files a picture, and what says where it is */
 async function takePicture(files) {
-  const file = files.find(({ name }) => IS_PICTURE.test(name));
+  const file = files.find(({ name }) => KINDS.some((kind) => name.toLowerCase().endsWith(kind)));
   if (!file) return say(`${files[0].name} is no picture. Choose a GeoTIFF, or a PNG or JPEG with its world file.`, "error");
   const start = data.start ?? (await attempt(() => get("start")));
   if (!start || refuseLarge(file, start)) return;

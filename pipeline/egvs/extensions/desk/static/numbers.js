@@ -42,7 +42,7 @@ export function parseNumber(text, limits = {}) {
   return value === 0 ? 0 : value;
 }
 
-/** Throws a RangeError: such a number is wrong, however it goes on. @param {number} value @param {Limits} limits */
+/** Throws a RangeError, so that a number outside its limits is told from one that cannot be read. @param {number} value @param {Limits} limits */
 function checkLimits(value, { min, max, whole }) {
   if (whole && !Number.isInteger(value)) throw new RangeError("Type a whole number.");
   if (min !== undefined && value < min) throw new RangeError(`The smallest value is ${fieldText(min)}.`);

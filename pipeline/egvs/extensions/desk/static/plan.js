@@ -8,8 +8,7 @@ import { change, data, isBusy, runJob, update } from "./store.js";
 import { drawTrial } from "./trial.js";
 import { drawWhatIf } from "./what_if.js";
 
-const MOST_SENSORS = 12;
-/** Steps of the budget's slider, about. */
+/** Approximate number of steps of the budget's slider. */
 const STEPS = 40;
 /** What is being chosen. */
 const request = { by: "count", count: 2, budget: /** @type {number|null} */ (null) };
@@ -44,7 +43,7 @@ const choose = latestWins(async (/** @type {Record<string, unknown>} */ body) =>
 // ---------------------------------------------------------------- count or budget
 
 function chooser() {
-  const most = Math.max(1, Math.min(MOST_SENSORS, data.project.sites.length));
+  const most = Math.max(1, Math.min(data.project.costs.most_sensors, data.project.sites.length));
   request.count = Math.min(request.count, most);
   const redraw = () => update({ plan: data.plan });
   return h("section.card", {},

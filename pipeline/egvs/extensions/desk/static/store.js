@@ -154,7 +154,7 @@ async function send(method, path, body, onRefusal, keep_results = true) {
   if (!question) return answer;
   const text = `${question} ${path === "undo" ? "Redo" : "Undo"} brings them back.`;
   if (await ask("The results will be out of date", text, "Change", "Keep the results")) return send(method, path, body, onRefusal, false);
-  update({ project: data.project }); // shows what is still so
+  update({ project: data.project }); // puts the fields back
   return null;
 }
 

@@ -5,7 +5,7 @@ import { button } from "./fields.js";
 import { candidateOf, mapView } from "./desk_map.js";
 import { attempt, data, isBusy, say, update } from "./store.js";
 
-/** Fewer pixels where the processor draws them, or a drag in the frame takes seconds. */
+/** Half the resolution: in software, a drag in the frame would take seconds. */
 const COARSE = "&fixedDpr=0.5";
 
 const tool = button("3D", toggle, { title: "3D view of the run", pressed: false });
@@ -14,7 +14,7 @@ let box = null;
 /** What the frame shows. */
 let shown = "";
 
-/** Whether the processor draws, for want of a graphics card that the browser may use. */
+/** Whether the browser draws in software, without a graphics card. */
 function isSoftware() {
   const graphics = document.createElement("canvas").getContext("webgl2");
   const details = graphics?.getExtension("WEBGL_debug_renderer_info");

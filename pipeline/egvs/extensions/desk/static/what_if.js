@@ -66,6 +66,6 @@ async function compute() {
 function result(whatIf) {
   return h("div", {}, (whatIf.text ?? []).map((/** @type {string} */ text) => h("p", {}, capitalised(text))),
     h("div.table", {}, h("table", {}, h("caption.unseen", {}, "Scores with and without the obstacles"),
-      h("thead", {}, h("tr", {}, ["Pole", "Before", "After", "Change"].map((title) => h("th", { scope: "col" }, title)))),
-      h("tbody", {}, whatIf.poles.slice(0, 10).map((/** @type {any} */ pole) => h("tr", {}, h("th", { scope: "row" }, pole.pole), h("td", {}, pole.before_text), h("td", {}, pole.after_text), h("td", {}, pole.change_text)))))));
+      h("thead", {}, h("tr", {}, ["Sensor", "Before", "After", "Change"].map((title) => h("th", { scope: "col" }, title)))),
+      h("tbody", {}, whatIf.sites.slice(0, 10).map((/** @type {any} */ site) => h("tr", {}, h("th", { scope: "row" }, site.site), h("td", {}, site.before_text), h("td", {}, site.after_text), h("td", {}, site.change_text)))))));
 }
