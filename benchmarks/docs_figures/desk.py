@@ -38,7 +38,7 @@ def draw(folder: Path, images: Path) -> None:
             step(tab)
             tab.wait_for_timeout(1000)
             picture = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
-            picture.quantize(64, dither=Image.Dither.NONE).save(images / file, optimize=True)
+            picture.quantize(256, dither=Image.Dither.NONE).save(images / file, optimize=True)
         server.terminate()
 
 
