@@ -382,6 +382,14 @@ def test_counts_open_ring(tmp_path: Path) -> None:
     assert summary.statics.counts.heights["building"]["levels"] == 2
 
 
+@pytest.mark.slow
+def test_row_of_trees_around_the_world_is_left_out(tmp_path: Path) -> None:
+    far = edited(tmp_path, ('<node id="173" lat="51.9998203" lon="9.9985439"/>', '<node id="173" lat="51.9" lon="174"/>'))
+    counts = create_scenario(tmp_path / "far", far).statics.counts
+    assert counts.dropped["too_long"] == {"tree row": 1}
+    assert counts.heights["tree"].total() == 3, "those mapped singly"
+
+
 # --- a real town ---------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> Made:

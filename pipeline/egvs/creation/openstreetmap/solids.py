@@ -44,6 +44,9 @@ from egvs.world.map_features import SolidType, SolidTypes, VerticalExtent
 
 TREE = map_features.SOLID_TYPES["natural.tree"]
 ROW_SPACING_M = 8.0
+LONGEST_ROW_M = 50_000.0
+"""A longer row of trees has a misplaced node."""
+
 
 DECK_THICKNESS_M = 1.0
 DECK = SolidType(DECK_BASE_M + DECK_THICKNESS_M, thickness_m=DECK_THICKNESS_M)
@@ -512,6 +515,9 @@ def find_trees(
             continue
         number = 0
         for line in way_lines(way, xy, pairs):
+            if line.length > LONGEST_ROW_M:
+                counts.drop("tree row", "too_long")
+                continue
             for point in _row_points(line):
                 if not single_points.is_empty and single_points.distance(point) < ROW_SPACING_M / 2:
                     counts.drop("tree", "row_tree_mapped_singly")
