@@ -405,8 +405,10 @@ def add_winding_numbers(triangles, signs, shape, voxel_m, winding):  # type: ign
         tri = triangles[n]
         low_x, high_x = min(tri[0, 0], tri[1, 0], tri[2, 0]), max(tri[0, 0], tri[1, 0], tri[2, 0])
         low_y, high_y = min(tri[0, 1], tri[1, 1], tri[2, 1]), max(tri[0, 1], tri[1, 1], tri[2, 1])
-        for ix in range(max(0.0, np.floor(low_x / voxel_m) - 1), min(float(nx), np.ceil(high_x / voxel_m) + 1)):
-            for iy in range(max(0.0, np.floor(low_y / voxel_m) - 1), min(float(ny), np.ceil(high_y / voxel_m) + 1)):
+        first_x, end_x = max(0.0, np.floor(low_x / voxel_m) - 1), min(float(nx), np.ceil(high_x / voxel_m) + 1)
+        first_y, end_y = max(0.0, np.floor(low_y / voxel_m) - 1), min(float(ny), np.ceil(high_y / voxel_m) + 1)
+        for ix in range(np.int64(first_x), np.int64(end_x)):
+            for iy in range(np.int64(first_y), np.int64(end_y)):
                 sign, z = vertical_crossing(tri, (ix + 0.5) * voxel_m, (iy + 0.5) * voxel_m)
                 if sign != 0:
                     k = np.int64(min(max(np.ceil(z / voxel_m - 0.5), 0.0), float(nz)))

@@ -264,7 +264,8 @@ def _geographic_points(
 
     projection = _utm(lat_deg, lon_deg)
     eastings_m = WorldFrame(projection).from_lon_lat(lon_lat_deg)
-    corner_m = np.floor(np.nanmin(np.where(np.isfinite(eastings_m), eastings_m, np.nan), axis=0))
+    _check_extent(eastings_m, used, path)
+    corner_m = np.floor(eastings_m.min(axis=0))
     frame = WorldFrame(projection, (-float(corner_m[0]), -float(corner_m[1])))
     return np.add(eastings_m, frame.offset_m), frame
 
@@ -275,7 +276,10 @@ def _lon_lat_deg(lanelet_map: LaneletMap, used: list[int]) -> FloatArray:
 
 
 def _check_extent(xy_m: FloatArray, used: list[int], path: Path) -> None:
-    """Raise an InputError when a point lies far from all others."""
+    """Raise an InputError when a point lies far from all others, or all far from the origin of the projection."""
+    if not np.isfinite(xy_m).all(axis=1).any():
+        problem = "its points are on another side of the Earth than the origin of its projection"
+        raise InputError(path, problem, f"Correct their lat and lon, or the origin in {PROJECTOR_FILE}.")
     distances_m = np.hypot(*(xy_m - np.median(xy_m[np.isfinite(xy_m).all(axis=1)], axis=0)).T)
     far = np.flatnonzero(~(distances_m <= MAX_EXTENT_M))
     if len(far):
