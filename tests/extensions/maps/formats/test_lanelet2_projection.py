@@ -195,5 +195,5 @@ def test_rejects_map_whose_points_are_all_far_from_their_middle(tmp_path: Path) 
     path = square_map().write(tmp_path / "map.osm")
     text = re.sub(r'(<node id="[12]" lat="[^"]*" lon=")[^"]*', r"\g<1>-170", path.read_text(encoding="utf-8"))
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match="its points are on another side of the Earth|from the middle of the map"):
+    with pytest.raises(InputError, match=r"its points are on another side of the Earth|from the middle of the map"):
         project(path)
