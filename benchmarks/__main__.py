@@ -38,6 +38,7 @@ from benchmarks import (
     stability,
     start_up,
 )
+from benchmarks.losses import OFF
 from benchmarks.records import LIMITS_TABLE, Record, limit_results, table_results
 from benchmarks.scenes import run_stage
 from egvs.artefacts.tpog import read_tpog
@@ -142,7 +143,7 @@ def occupancy(folder: Path, sumo: float) -> list[tuple[str, str, str, bool]]:
 
 def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
     """Time scan and score of single sites: from static world and TPOG in memory to a score."""
-    scenario, run = egvs.load(SCENARIO), folder / "run"
+    scenario, run = egvs.load(SCENARIO, [OFF]), folder / "run"
     scene = scene_inputs.resolve_scene(scenario, read_ply(run / "statics.ply")[0])
     occupancy_grid = read_tpog(run / "tpog.parquet")
     scanner, scorer, visibility = Scanner(scene), Scorer(scene, occupancy_grid), HitCounter(scene, occupancy_grid)

@@ -20,8 +20,8 @@ STARTS = 9
 
 HELP, RUN = "egvs --help", "egvs run, all stages up to date"
 LIBRARIES = {
-    HELP: ("import typer.main, typer.rich_utils", 1.5),
-    RUN: ("import typer.main, pydantic", 3.5),
+    HELP: ("import typer.main, typer.rich_utils", 2.0),
+    RUN: ("import typer.main, pydantic, pyarrow.parquet", 4.0),
 }
 """For each command, the libraries that it needs, and how many times as long as their import it may take."""
 

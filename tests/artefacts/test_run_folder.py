@@ -46,6 +46,7 @@ def test_no_run_overwrites_a_file_of_the_user_that_an_extension_would_write(site
     (out / "visits.txt").write_text("mine")
     assert list(foreign_files(out)) == []
     declare(site, "RunFile('visits.txt', 'visit')")
+    run_folder.plugins._all_entry_points.cache_clear()
     run_folder.plugins._entry_points_by_name.cache_clear()
     run_folder.extension_files.cache_clear()
     assert list(foreign_files(out)) == ["visits.txt"]

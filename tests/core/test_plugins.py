@@ -46,6 +46,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def clear_caches() -> None:
     plugins.load_plugin.cache_clear()
+    plugins._all_entry_points.cache_clear()
     plugins._entry_points_by_name.cache_clear()
     readers._table.cache_clear()
 

@@ -11,7 +11,7 @@ https://packaging.python.org/en/latest/specifications/entry-points/
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import Distribution, EntryPoint, entry_points
+from importlib.metadata import Distribution, EntryPoint, EntryPoints, entry_points
 from importlib.util import find_spec
 from operator import attrgetter
 from typing import Any, TypeVar
@@ -168,8 +168,14 @@ def _entry_points_by_name(group: str) -> dict[str, EntryPoint]:
         package = _distribution_name(entry.dist)
         return package != PACKAGE_NAME, package, entry.value
 
-    entries = sorted(entry_points(group=group), key=priority)
+    entries = sorted(_all_entry_points().select(group=group), key=priority)
     return {entry.name: entry for entry in reversed(entries)}
+
+
+@cache
+def _all_entry_points() -> EntryPoints:
+    """Read the entry points of all groups at once: each reading opens the metadata of every installed package."""
+    return entry_points()
 
 
 @cache
