@@ -8,7 +8,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # Every process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run environment test test-slow test-nightly without test-train test-lowest test-portable unit check lint wheel project-files image image-test bench bench-history bench-peers scaling numerics docs-figures schema reference docs notebooks fuzz clean
+.PHONY: run environment test test-slow test-nightly without test-train test-lowest test-portable unit check lint wheel project-files image image-test bench bench-history bench-peers scaling numerics docs-figures schema reference docs notebooks fuzz mutants clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -135,6 +135,11 @@ notebooks: $(VENV)/.installed-notebooks
 # FUZZ: options, as in FUZZ="--cases 10000 --seed 2"; what is bad lies in build/fuzz
 fuzz: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.fuzz $(FUZZ)
+
+# Changes the code in one place at a time, and lists what no test notices. MUTANTS: options and modules
+mutants: $(VENV)/.installed-dev
+	$(INSTALL) --no-build-isolation --editable '.[mutants]'
+	$(BIN)/python .ci/mutants.py $(MUTANTS)
 
 schema: $(VENV)/.installed
 	$(BIN)/python -c "from egvs.scenario.loading import json_schema; print(json_schema(), end='')" > data_schemas/scenario.schema.json
