@@ -162,9 +162,7 @@ _IND = bases.tracks(writers.write_levelx, "car", "pedestrian")
 _HIGHD = bases.tracks(writers.write_highd, "car", "truck", straight=True)
 _TAF_BW = bases.tracks(writers.write_taf_bw, "car", "pedestrian")
 
-_SCENARIO_COLUMNS = (
-    "track_id", "object_type", "timestep", "position_x", "position_y", "heading", "start_timestamp", "city",
-)  # fmt: skip
+_SCENARIO_COLUMNS = ("track_id", "object_type", "timestep", "position_x", "position_y", "heading")
 
 _ALL = (
     _input("scenario.toml", "scenario.toml", bases.plain, meaning.toml, True),
@@ -256,7 +254,7 @@ _ALL = (
       for file in ("label/virtuallidar/*.json", "data_info.json", "calib/virtuallidar_to_world/*.json")),
     _tracks("10001.csv", bases.tracks(writers_json.write_v2x_seq_tfd, "car", "bicycle"), meaning.table),
     _tracks("scenario_hand-made.parquet", bases.tracks(writers_json.write_argoverse2_scenario, "car", "bus"),
-            partial(meaning.parquet, columns=_SCENARIO_COLUMNS)),
+            partial(meaning.parquet, columns=_SCENARIO_COLUMNS, optional=("start_timestamp", "city"))),
     *(_tracks(file, bases.tracks(writers_json.write_argoverse2, "car", "bus"), meaning.feather, "annotations.feather")
       for file in ("annotations.feather", "city_SE3_egovehicle.feather")),
     _tracks("trace_gt_hand-made.osi", bases.tracks(writers_json.write_osi, "car", "tram"), meaning.bytes_themselves),

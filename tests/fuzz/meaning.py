@@ -157,13 +157,14 @@ def words(data: bytes) -> object:
     return [line.split() for line in data.decode().splitlines()]
 
 
-def parquet(data: bytes, columns: Sequence[str] | None = None) -> object:
-    """Columns and values; of some columns if the others are not read."""
+def parquet(data: bytes, columns: Sequence[str] | None = None, optional: Sequence[str] = ()) -> object:
+    """Columns and values; of some columns, and of optional ones that are there, if the others are not read."""
     import pyarrow
     import pyarrow.parquet as pq
 
-    table = pq.read_table(pyarrow.BufferReader(data), columns=columns and list(columns))
-    return repr(table.to_pydict())
+    there = set(pq.read_schema(pyarrow.BufferReader(data)).names)
+    wanted = columns and [*columns, *(name for name in optional if name in there)]
+    return repr(pq.read_table(pyarrow.BufferReader(data), columns=wanted).to_pydict())
 
 
 def feather(data: bytes) -> object:
