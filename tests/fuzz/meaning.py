@@ -113,17 +113,22 @@ def rows(data: bytes) -> object:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("cp1252")
-    table = [[cell.strip() for cell in row] for row in csv.reader(io.StringIO(text, newline="")) if row]
+    table = _cells(text)
     if any(len(row) != len(table[0]) for row in table):
         raise ValueError("rows of different lengths")
     return table
 
 
+def _cells(text: str) -> list[list[str]]:
+    """Cells of a CSV; between semicolons, a decimal comma is a point."""
+    is_german = ";" in (head := text.partition("\n")[0]) and "," not in head
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=";" if is_german else ",")
+    return [[cell.strip().replace(",", ".") if is_german else cell.strip() for cell in row] for row in rows if row]
+
+
 def table(data: bytes) -> object:
     """Cells of a CSV, each row as long as the header, beside which only empty ones may stand."""
-    lines = [
-        [cell.strip() for cell in row] for row in csv.reader(io.StringIO(data.decode("utf-8-sig"), newline="")) if row
-    ]
+    lines = _cells(data.decode("utf-8-sig"))
     if any(len(row) < len(lines[0]) or any(row[len(lines[0]) :]) for row in lines):
         raise ValueError("rows of different lengths")
     return [row[: len(lines[0])] for row in lines]

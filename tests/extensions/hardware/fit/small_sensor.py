@@ -23,6 +23,11 @@ def small_sensor(azimuth_deg: tuple[float, float] | None = None) -> Sensor:
     return Sensor("small", ELEVATIONS_DEG, OFFSETS_DEG, azimuths, 120.0, "test", azimuth_deg=azimuth_deg)
 
 
+def returns_of(points: FloatArray) -> FloatArray:
+    """Return the points without missing returns."""
+    return points[np.isfinite(points[:, 0])]
+
+
 def coarse_sensor() -> Sensor:
     """The same channels with 300 azimuths."""
     return replace(small_sensor(), azimuths=300)

@@ -11,7 +11,6 @@ from benchmarks.sensor_fit import angle_errors
 from benchmarks.simulated_sweeps import Truth
 
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
 from egvs.extensions.hardware.fit.beam_angles import fit_beam_angles, pulse_grid, range_step, share_offsets
 from egvs.extensions.hardware.fit.fit import fit_sensor
 from egvs.formats.sweep_files import Sweep
@@ -20,15 +19,11 @@ from tests.extensions.hardware.fit.small_sensor import (
     ELEVATIONS_DEG,
     OFFSETS_DEG,
     TRUTH,
+    returns_of,
     small_fit,
     small_sensor,
     sweep_of,
 )
-
-
-def returns_of(points: FloatArray) -> FloatArray:
-    """Return the points without missing returns."""
-    return points[np.isfinite(points[:, 0])]
 
 
 def test_organised_sweep_gives_all_angles() -> None:

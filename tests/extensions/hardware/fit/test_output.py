@@ -21,7 +21,14 @@ from egvs.formats import point_clouds
 from egvs.formats.sweep_files import Sweep
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.sensors.sensor import resolve_sensor
-from tests.extensions.hardware.fit.small_sensor import ELEVATIONS_DEG, TRUTH, small_fit, small_sensor, sweep_of
+from tests.extensions.hardware.fit.small_sensor import (
+    ELEVATIONS_DEG,
+    TRUTH,
+    returns_of,
+    small_fit,
+    small_sensor,
+    sweep_of,
+)
 
 
 def read_config(text: str, name: str) -> SensorConfig:
@@ -49,6 +56,16 @@ def test_field_of_view_is_written() -> None:
     expected = sensor.directions().reshape(301, 10, 3)[:, order]
     angle = np.degrees(np.arccos(np.clip((fitted.directions().reshape(301, 10, 3) * expected).sum(axis=-1), -1, 1)))
     assert angle.max() < 0.002
+
+
+@pytest.mark.parametrize("view_deg", [(-50.0, 70.0), (130.0, 260.0), (-240.0, 30.0)])
+def test_view_of_a_list_is_within_the_limits_of_its_key(view_deg: tuple[float, float]) -> None:
+    points = sweep_of(TRUTH, small_sensor(view_deg))
+    fit = fit_sensor([Sweep("list", returns_of(points))])
+    first_deg, last_deg = read_config(output.table_text(fit, "list"), "list").azimuth_deg or (0.0, 0.0)
+    assert -360.0 <= first_deg < last_deg <= 360.0
+    assert np.mod(first_deg - view_deg[0] + 180.0, 360.0) - 180.0 == pytest.approx(0.0, abs=3.0)
+    assert last_deg - first_deg == pytest.approx(view_deg[1] - view_deg[0], abs=5.0)
 
 
 def test_empty_sector_is_left_out() -> None:

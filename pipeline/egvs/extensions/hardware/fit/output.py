@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import tomllib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -103,9 +104,9 @@ def write_fit(fit: SensorFit, name: str, folder: str | Path, *, without_empty_se
 
 def table_text(fit: SensorFit, name: str, without_empty_sector: bool = False) -> str:
     """Return the lines of ``[sensors.NAME]``; raises as :func:`sensor_table`."""
-    config = sensor_table(fit, without_empty_sector)
-    SensorConfig.from_dict(config)  # a scenario can read it
-    return format_sensor_table(name, config)
+    text = format_sensor_table(name, sensor_table(fit, without_empty_sector))
+    SensorConfig.from_dict(tomllib.loads(text)["sensors"][name])  # a scenario can read it
+    return text
 
 
 def sensor_table(fit: SensorFit, without_empty_sector: bool = False) -> dict[str, Any]:
@@ -121,7 +122,7 @@ def sensor_table(fit: SensorFit, without_empty_sector: bool = False) -> dict[str
     angles = fit.angles
     order = angles.ascending
     offsets_deg = angles.azimuth_offset_deg[order]
-    step_deg = angles.grid_step_deg
+    step_deg = float(angles.grid_step_deg)
     table: dict[str, Any] = {"elevations_deg": _rounded(angles.elevation_deg[order])}
     if without_empty_sector:
         first_deg, last_deg = _view_without_empty_sector(fit)
@@ -134,10 +135,13 @@ def sensor_table(fit: SensorFit, without_empty_sector: bool = False) -> dict[str
         table["azimuth_step_deg"] = step_deg
     else:
         step_deg = round(step_deg, 6)
-        first_deg = round(angles.first_azimuth_deg, _ANGLE_DIGITS)
+        first_deg = float(round(angles.first_azimuth_deg, _ANGLE_DIGITS))
         table["azimuth_offsets_deg"] = _rounded(offsets_deg)
         table["azimuth_step_deg"] = step_deg
-        table["azimuth_deg"] = [first_deg, first_deg + (angles.azimuths - 1) * step_deg]
+        span_deg = (angles.azimuths - 1) * step_deg
+        if first_deg + span_deg > 360.0:  # the limit of the key
+            first_deg -= 360.0
+        table["azimuth_deg"] = [first_deg, first_deg + span_deg]
     table["range_m"] = round(fit.max_range_m, 2)
     if fit.sigma_m is not None:
         table["range_sigma_m"] = round(fit.sigma_m.value, 5)
