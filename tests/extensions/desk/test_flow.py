@@ -18,6 +18,8 @@ from http.server import BaseHTTPRequestHandler
 from itertools import chain
 from pathlib import Path
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from tests.creation.overpass_server import overpass_server, recorded_answer
@@ -108,6 +110,14 @@ def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:
     ranking = desk.ok("GET", "/api/ranking")
     assert sorted(pole["pole"] for pole in ranking["poles"]) == ["lamp1", "new1", "signal1"]
     assert not ranking["outdated"]
+    traffic = desk.ok("GET", "/api/traffic")
+    assert (len(traffic["moments"]), traffic["first_s"], traffic["period_s"]) == (60, 0.0, 1.0)
+    recorded = pq.read_table(tmp_path / "work" / "runs" / "town" / "trajectories.parquet").to_pylist()
+    for number, moment in enumerate(traffic["moments"]):
+        rows = [row for row in recorded if row["frame"] == number]
+        keys = ("x_m", "y_m", "yaw_rad", "length_m", "width_m")
+        expected = sorted([row[key] for key in keys] for row in rows)
+        assert np.allclose(sorted(moment), expected, atol=0.0051) if expected else not moment
     command = [sys.executable, "-m", "egvs", "run", "town", "--out", str(tmp_path / "again")]
     subprocess.run(command, cwd=tmp_path / "work", check=True, capture_output=True)
     scores = [folder / "scores.parquet" for folder in (tmp_path / "work" / "runs" / "town", tmp_path / "again")]
@@ -139,6 +149,7 @@ def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:
 def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_path: Path) -> None:
     desk.ok("POST", "/api/open", {"scenario": "mini"})
     assert desk.refused("GET", "/api/ranking")[0] == 404
+    assert desk.refused("GET", "/api/traffic")[0] == 409
     for path in ("/api/score", "/api/three"):
         assert desk.refused("POST", path, {"site": "pole_a"})[0] == 409
     with listening(desk) as events:

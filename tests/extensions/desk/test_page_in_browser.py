@@ -422,6 +422,27 @@ def test_plan_that_cannot_be_is_explained(finished: Any) -> None:
     assert_accessible(tab)
 
 
+def test_recorded_traffic_is_shown_on_the_map(finished: Any) -> None:
+    tab = finished
+    go(tab, "Run")
+    vehicles = tab.locator("g.vehicles path")
+    assert vehicles.count() == 0
+    tab.get_by_role("button", name="Show the traffic on the map").click()
+    vehicles.wait_for(state="attached")
+    slider = tab.get_by_role("slider", name="Moment")
+    number = int(tab.locator("output[for=moment]").inner_text().split(": ")[1].split()[0])
+    drawn = vehicles.get_attribute("d")
+    assert drawn.count("M") == number > 0
+    slider.press("ArrowRight")
+    assert vehicles.get_attribute("d") != drawn
+    tab.get_by_role("button", name="Play").click()
+    wait_until(tab, lambda: slider.input_value() not in ("0", "1"))
+    tab.get_by_role("button", name="Pause").click()
+    assert_accessible(tab)
+    go(tab, "Decide")
+    assert vehicles.count() == 0
+
+
 def test_results_stay_until_a_change_is_confirmed(finished: Any, folder: Path) -> None:
     tab, sites = finished, folder / "mini" / "sites.csv"
     before = sites.read_text()

@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from egvs.artefacts import parquet
+from egvs.artefacts.frame_boxes import read_boxes
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
+from egvs.core.grid import Grid
 from egvs.core.wording import format_percent
 from egvs.placement import problem_builder
 from egvs.results.plans import SensorPlan
@@ -27,6 +30,12 @@ _NO_SCORES = ("placement", "costs", "what_if")
 
 MOST_SENSORS = 12
 """Sensors of the largest plan that the page offers."""
+
+MOMENTS = 60
+"""Moments of recorded traffic that the map shows, one after another, from the middle of the recording."""
+
+MOST_VEHICLES = 200
+"""Road users of a moment that the map shows: those nearest to the middle of the region of interest."""
 
 
 def describe_run(folder: Path, scenario: Scenario) -> dict[str, Any]:
@@ -92,6 +101,23 @@ def describe_ranking(folder: Path) -> dict[str, Any]:
             "score": _finite(best.score), "score_text": by.with_unit(best.score, se),
         })  # fmt: skip
     return {"label": by.head, "noun": by.noun, "poles": poles}
+
+
+def describe_traffic(folder: Path) -> dict[str, Any]:
+    """Return moments of the traffic of a run: x, y, yaw, length and width of each road user, metres and radians."""
+    recorded, path = run_sources.recorded_scenario(folder), RunFolder(folder).trajectories
+    frames = int(parquet.read_metadata(path, "trajectories")["frames"])
+    first = max(0, (frames - MOMENTS) // 2)
+    wanted = np.arange(first, min(frames, first + MOMENTS))
+    moments: list[list[list[float]]] = [[] for _ in wanted]
+    for part in read_boxes(path, Grid((0.0, 0.0, 0.0), 1.0, (1, 1, 1)), wanted):
+        away_m = np.hypot(*(part.values[:, :2] - recorded.roi.center_m[:2]).T)
+        for frame in np.unique(part.frame):
+            there = np.flatnonzero(part.frame == frame)
+            nearest = there[np.argsort(away_m[there], kind="stable")[:MOST_VEHICLES]]
+            moments[frame - first] = np.round(part.values[nearest][:, [0, 1, 3, 5, 6]], 2).tolist()
+    period_s = recorded.traffic.frame_period_s
+    return {"moments": moments, "first_s": round(first * period_s, 3), "period_s": period_s}
 
 
 def describe_plan(folder: Path, adds: Mapping[str, list[str]]) -> dict[str, Any] | None:

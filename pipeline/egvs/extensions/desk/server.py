@@ -430,6 +430,10 @@ class Desk:
         outdated = self.project.run_state()["state"] == "outdated"
         return {"outdated": outdated, **results_view.describe_ranking(self.project.run_folder)}
 
+    def show_traffic(self, _body: Body) -> Answer:
+        """Return some moments of the recorded traffic."""
+        return results_view.describe_traffic(self._finished_run())
+
     def show_plan(self, _body: Body) -> Answer:
         """Return the plan."""
         made, adds = self._additions
@@ -728,7 +732,8 @@ def make_application(desk: Desk) -> Starlette:
         Route("/api/settings", endpoint(desk.set_settings), methods=["PUT"]),
         post("/api/undo", endpoint(desk.undo)), post("/api/redo", endpoint(desk.redo)),
         post("/api/run", endpoint(desk.run, 202)), post("/api/stop", endpoint(desk.stop)),
-        get("/api/ranking", endpoint(desk.ranking)), post("/api/plan", endpoint(desk.plan, 202)),
+        get("/api/ranking", endpoint(desk.ranking)), get("/api/traffic", endpoint(desk.show_traffic)),
+        post("/api/plan", endpoint(desk.plan, 202)),
         get("/api/plan", endpoint(desk.show_plan)), post("/api/score", endpoint(desk.score)),
         post("/api/additions", endpoint(desk.additions, 202)), post("/api/trial", endpoint(desk.trial, 202)),
         get("/api/downloads", endpoint(desk.downloads)),

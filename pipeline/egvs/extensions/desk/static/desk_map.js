@@ -115,13 +115,18 @@ function deskItems() {
 
 /** @param {any} obstacle @returns {Item} */
 function obstacleItem(obstacle) {
-  const [l, w, yaw] = [obstacle.length_m / 2, obstacle.width_m / 2, (obstacle.yaw_deg * Math.PI) / 180];
-  /** @type {Point[]} */
-  const corners = [[l, w], [-l, w], [-l, -w], [l, -w]];
   return {
     id: `obstacle ${obstacle.name}`, at_m: [obstacle.x_m, obstacle.y_m], label: obstacle.name, kind: "obstacle", title: `obstacle ${obstacle.name}`,
-    movable: !isBusy(), outline_m: corners.map(([x, y]) => [x * Math.cos(yaw) - y * Math.sin(yaw), x * Math.sin(yaw) + y * Math.cos(yaw)]),
+    movable: !isBusy(), outline_m: corners([0, 0], (obstacle.yaw_deg * Math.PI) / 180, obstacle.length_m, obstacle.width_m),
   };
+}
+
+/** Corners of a rectangle. @param {Point} middle_m @param {number} yaw radians @param {number} length_m @param {number} width_m @returns {Point[]} */
+export function corners([x, y], yaw, length_m, width_m) {
+  const [c, s] = [Math.cos(yaw) / 2, Math.sin(yaw) / 2];
+  return [[1, 1], [-1, 1], [-1, -1], [1, -1]].map(([along, across]) => [
+    x + along * length_m * c - across * width_m * s, y + along * length_m * s + across * width_m * c,
+  ]);
 }
 
 /** Site that a candidate or pole of the results belongs to. @param {string} name */

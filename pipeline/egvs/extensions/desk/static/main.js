@@ -7,6 +7,7 @@ import { drawJob } from "./progress.js";
 import { drawStart } from "./start.js";
 import { drawPoles } from "./poles.js";
 import { drawCounts, drawDiagram } from "./counts.js";
+import { stopReplay } from "./replay.js";
 import { drawRun } from "./run.js";
 import { drawPlan } from "./plan.js";
 import { drawTake } from "./take.js";
@@ -87,6 +88,7 @@ function draw(changed) {
   if (data.revision < 0) return;
   if (changed.size === 1 && changed.has("job") && isBusy() === wasBusy) return;
   wasBusy = isBusy();
+  if (data.step !== "run" || !data.ranking) stopReplay();
   keepingFocus(panel, () => {
     if (!data.project) return drawStart(panel);
     const step = STEPS.find(({ id }) => id === data.step);

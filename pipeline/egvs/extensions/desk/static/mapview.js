@@ -72,7 +72,8 @@ export class MapView {
     /** @type {Map<number, PointerEvent>} */ this.pointers = new Map();
     this.picture = s("g.picture");
     this.ground = s("g.ground");
-    this.world = s("g", {}, this.picture, this.ground);
+    this.vehicles = s("g.vehicles");
+    this.world = s("g", {}, this.picture, this.ground, this.vehicles);
     this.outlines = s("g.outlines");
     this.marks = s("g.marks");
     this.extra = s("g.extra");
@@ -150,6 +151,11 @@ export class MapView {
     show(this.ground, edges, roads, strips,
       [...solids].map(([kind, d]) => s(`path.solid.${kind}`, { d })),
       shapes.roi_m && s("path.roi", { d: pathData(shapes.roi_m, true) }));
+  }
+
+  /** Show road users. @param {Point[][]} outlines_m corners of each */
+  setVehicles(outlines_m) {
+    show(this.vehicles, outlines_m.length > 0 && s("path", { d: outlines_m.map((corners) => pathData(corners, true)).join("") }));
   }
 
   /** Show a picture below the map. @param {string} href empty for none @param {number[]} matrix from its pixels to metres */

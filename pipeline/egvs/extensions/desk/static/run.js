@@ -4,6 +4,7 @@ import { h, show } from "./dom.js";
 import { button, numberField, pagedTable, turnTo } from "./fields.js";
 import { capitalised, duration, readable } from "./numbers.js";
 import { choosePole, siteOf } from "./desk_map.js";
+import { drawReplay } from "./replay.js";
 import { save } from "./take.js";
 import { attempt, change, data, isBusy, runJob, say, update } from "./store.js";
 
@@ -31,7 +32,8 @@ export function drawRun(panel) {
       run.state === "complete" && button("Save the report", () => save({ id: "report", title: "Report" }), { isDisabled: isBusy() })),
     job?.kind === "run" && job.state === "failed" && h("p.reason", { role: "alert" }, job.message, job.hint && ` ${job.hint}`),
     checked?.key === filesKey() && problems(checked),
-    ranking && drawRanking(ranking));
+    ranking && drawRanking(ranking),
+    ranking && drawReplay());
 }
 
 /** @type {Record<string, string>} */
