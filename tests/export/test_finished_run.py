@@ -40,7 +40,7 @@ def test_rejects_an_unfinished_run_and_one_of_another_version(local: Path, tmp_p
         path.write_text(files.to_json_text(value if content is None else add_checksum(value)))
         code, _, err = run_egvs("export", path.parent, "--to", "csv", "--out", tmp_path / "out")
         problem = f"the stage {first} is not finished, or was run by another version of egvs"
-        assert (code, err) == (2, f'egvs: {path}: {problem}. Repeat "egvs run".\n')
+        assert (code, err) == (2, f'egvs: {path}: {problem}. Run "egvs run" with the options of this folder.\n')
         assert not (tmp_path / "out").exists()
 
 

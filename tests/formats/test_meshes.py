@@ -66,6 +66,7 @@ def hostile() -> Iterator[tuple[str, bytes, str]]:
     yield "m.obj", b"v 0 0 0\nv 1 0 \\\n0\nv 0 1 \n.0 0\nf 1 2 3\n", "line 5: '.0 0' does not start with a keyword"
     yield "m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n.0 6\nf 1 2 3\n", "line 4: '.0 6' does not start with a keyword"
     yield "m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2 0/1/0\n", "line 5: 'f 1 2 0' refers to vertex 0"
+    yield "m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 -0 3\n", "line 4: 'f 1 -0' refers to vertex 0"
     yield "m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 7 65\n", "line 5: 'f 7 65' is a face with fewer than three"
     yield "m.obj", b"\x80\x81\xff\xfe" * 100, "m.obj"
     yield "m.off", b"OFF\n3 1 0\n0 0 0\n", "m.off"

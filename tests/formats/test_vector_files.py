@@ -180,6 +180,15 @@ def test_coordinates_that_are_not_finite_give_no_warning(tmp_path: Path, suffix:
     assert not np.isfinite(feature["geometry"]["coordinates"]).all()
 
 
+def test_kml_with_a_coordinate_that_is_no_number_gives_no_warning(tmp_path: Path) -> None:
+    ring = "<LinearRing><coordinates>10,52,0 10.1,52,0 10.1,nan,0 10,52,0</coordinates></LinearRing>"
+    polygon = f"<Polygon><outerBoundaryIs>{ring}</outerBoundaryIs></Polygon>"
+    head = '<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Placemark><name>h</name>'
+    (tmp_path / "h.kml").write_text(f"{head}{polygon}</Placemark></Document></kml>", encoding="utf-8")
+    (feature,) = vector_files.read_gis_file(tmp_path / "h.kml", "Polygon")["features"]
+    assert not np.isfinite(feature["geometry"]["coordinates"]).all()
+
+
 def test_geometries_other_than_points_are_rejected(located: Path) -> None:
     frame = frame_of({"site": ["a", "b"], "z_m": [3.0, 3.0]})
     write(located / "poles.gpkg", frame.set_geometry(frame.to_crs(25832).buffer(2.0).to_crs(4326)))

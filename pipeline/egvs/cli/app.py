@@ -660,7 +660,7 @@ def new(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Instead of assumed traffic: your counts, a CSV file with columns street, approach (the side on which"
+            help="Instead of assumed traffic: your counts, a table with columns street, approach (the side on which"
             " vehicles arrive), turn, start and count; docs/scenarios.md.",
         ),
     ] = None,

@@ -65,7 +65,7 @@ class FinishedRun:
         for name in _READ_STAGES:
             if name not in record.stages:
                 problem = f"the stage {name} is not finished, or was run by another version of egvs"
-                raise InputError(record_path, problem, 'Repeat "egvs run".')
+                raise InputError(record_path, problem, 'Run "egvs run" with the options of this folder.')
         source = Path(os.path.normpath(folder / record.scenario_folder))
         if not source.is_dir():
             problem = f"the scenario folder {source} does not exist"

@@ -190,7 +190,7 @@ _OBJ_FAULTS = (
     (re.compile(rb"(?m)^[ \t]*[-+.0-9][^\n]*"), "does not start with a keyword"),
     (re.compile(rb"(?m)^v(?:[ \t]+[^ \t\r\n]+){0,2}[ \t\r]*$"), "has fewer than three coordinates"),
     (re.compile(rb"(?m)^f(?:[ \t]+[^ \t\r\n]+){0,2}[ \t\r]*$"), "is a face with fewer than three corners"),
-    (re.compile(rb"(?m)^f[ \t](?:[^\n]*[ \t])?0+(?=[ \t\r\n/]|\Z)"), "refers to vertex 0, but the first is 1"),
+    (re.compile(rb"(?m)^f[ \t](?:[^\n]*[ \t])?[-+]?0+(?=[ \t\r\n/]|\Z)"), "refers to vertex 0, but the first is 1"),
 )
 """Lines that a reader could only guess at."""
 

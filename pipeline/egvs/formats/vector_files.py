@@ -213,6 +213,7 @@ def _bounded_table(path: Path, rows: Iterator[pa.RecordBatch]) -> pa.Table:
     return pa.Table.from_batches(batches)
 
 
+@np.errstate(invalid="ignore")  # coordinates that are not finite are reported with the feature
 def _feature(row: Mapping[str, Any], geometry_column: str, path: Path) -> dict[str, Any]:
     """Return a GeoJSON feature of a row."""
     import shapely
@@ -220,8 +221,7 @@ def _feature(row: Mapping[str, Any], geometry_column: str, path: Path) -> dict[s
     shape = None
     if row[geometry_column] is not None:
         try:
-            with np.errstate(invalid="ignore"):  # coordinates that are not finite are reported with the feature
-                shape = shapely.from_wkb(row[geometry_column])
+            shape = shapely.from_wkb(row[geometry_column])
         except shapely.errors.ShapelyError as error:
             raise InputError(path, f"a geometry cannot be read ({error})", "Repair it in a GIS.") from None
     properties = {name: _plain_value(value) for name, value in row.items() if name != geometry_column}

@@ -334,7 +334,8 @@ def _read_counts(path: Path, where: str) -> list[dict[str, Any]]:
     """Return the counts of a table as rows of ``traffic.counts``; columns with names are for people."""
     if not path.is_file():
         raise InputError(where, f"no such file: {path}", "Give the path of a CSV file, or counts in rows.")
-    with reading.translate_errors(path, "a table in UTF-8"):
+    hint = "Save it as CSV in UTF-8; egvs new --counts FILE reads spreadsheets, too."
+    with reading.translate_errors(path, hint):
         text = path.read_text(encoding="utf-8-sig")
     first = text.partition("\n")[0]
     has_semicolons = first.count(";") > first.count(",")

@@ -214,8 +214,9 @@ class ApproachIndex:
                 for street in move.aliases if alias else (move.street,):
                     if name in approach_spellings(move.side, street):
                         return move.street, move.side
-        problem = f"expected the side on which vehicles arrive, got {text!r}"
-        raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {self.hint}")
+        problem = f"expected the side on which vehicles arrive, or the name of an approach, got {text!r}"
+        hint = f"Use N, north or southbound; none arrive on a one-way street that leads away. {self.hint}"
+        raise InputError(f"{where}: approach", problem, hint)
 
     def find(self, street: str, side: str | None, turns: Sequence[str], where: str) -> list[ApproachMovement]:
         """Return the movements that a planner means.
@@ -254,7 +255,7 @@ class ApproachIndex:
         missing = sorted(set(turns) - {move.turn for move in moves})
         if missing:
             problem = f"the approach {next(iter(approaches))} has no movement {' or '.join(missing)}"
-            raise InputError(where, problem, self.hint)
+            raise InputError(where, problem, f"Correct the row, or lanes and one-way streets of the map. {self.hint}")
         return moves
 
     @property
