@@ -200,6 +200,19 @@ def test_sheets_of_a_dropped_mast_are_removed(spaced: Path, run_egvs: Any, tmp_p
     egvs.place(egvs.load(scenario, ["placement.count=2", "placement.most_per_pole=1"]), spaced)
 
 
+def test_sheet_in_another_format_or_folder_is_one_more(spaced: Path, run_egvs: Any, tmp_path: Path) -> None:
+    scenario = spaced.parent / "crossing"
+    places = (spaced / "sheets", "svg"), (spaced / "more", "svg"), (spaced / "more", "pdf")
+    for folder, kind in places:
+        printed = run_egvs("sheets", spaced, "--format", kind, "--out", folder)[1]
+        assert "removed" not in printed
+    assert [len(list(folder.glob(f"*.{kind}"))) for folder, kind in places] == [2, 2, 2]
+    egvs.place(egvs.load(scenario, ["placement.excluded=['Mast West']", "placement.count=1"]), spaced)
+    run_egvs("sheets", spaced, "--format", "svg", "--out", spaced / "sheets")
+    assert [len(list(folder.glob(f"*.{kind}"))) for folder, kind in places] == [1, 1, 1]
+    egvs.place(egvs.load(scenario, ["placement.count=2", "placement.most_per_pole=1"]), spaced)
+
+
 def test_sheet_of_a_candidate_is_not_removed_with_those_of_a_plan(spaced: Path, tmp_path: Path) -> None:
     for height in (4, 5):
         sheet.write_sheets(spaced, [f"Mast West@{height}m"], kind="svg", out=tmp_path)

@@ -21,7 +21,9 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import KDTree
 
+from egvs.clouds.simulation import solid_reflectivity
 from egvs.core.grid import BoolArray, FloatArray, IntArray
+from egvs.effects.returns import ReturnProbability
 from egvs.extensions.hardware.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
@@ -48,8 +50,8 @@ _BLOCKED_BEAMS, _SILENT_RETURNS = 0.2, 0.1
 _MIN_EXPECTED = 5
 """Fewest expected returns of a bin, in all, whose absence says something."""
 _MIN_SILENT_DEG = 2.0
-SURE_RANGE = 0.5
-"""Surfaces within this share of the sensor's range are expected to return."""
+SURE_RANGE, SURE_PROBABILITY = 0.5, 0.9
+"""Surfaces within this share of the sensor's range are expected to return, if losses let so many of them return."""
 _CHANNEL_EXPECTED, _CHANNEL_RETURNS = 50, 0.05
 """A channel is checked from so many expected returns on, and missing below this share of them."""
 _MAX_CHANNELS = 256
@@ -73,8 +75,9 @@ class StaticWorld:
 
     def __init__(self, scene: Scene, planned: Pose) -> None:
         supports = scene.own_supports(planned)
-        world = without_solids(scene.world, supports) if supports else scene.world
-        self._caster = Caster(world, scene.roi)
+        self._scene = scene
+        self._world = without_solids(scene.world, supports) if supports else scene.world
+        self._caster = Caster(self._world, scene.roi)
         self._ground = _ground_heights(scene.world)
 
     def ranges_m(self, pose: Pose, directions: FloatArray, range_m: float) -> FloatArray:
@@ -89,9 +92,30 @@ class StaticWorld:
         range_m
             Maximum range.
         """
-        turned = np.ascontiguousarray(directions @ rotation_world_sensor(*pose.angles_deg).T)
-        scan = self._caster.sweep(pose.position_m, turned, range_m)
+        scan = self._caster.sweep(pose.position_m, _turn(directions, pose), range_m)
         return np.where(scan.returned, np.linalg.norm(scan.ends_m, axis=1), np.inf)
+
+    def expected(self, pose: Pose, sensor: Sensor) -> tuple[FloatArray, FloatArray]:
+        """Return the range at which each beam of a sensor ends, and the probability that it returns, (beams,) each.
+
+        The probability is that of simulated clouds: by range, reflectivity and angle of incidence. It is 1 where the
+        scene has no losses of returns, and 0 where a beam meets nothing.
+        """
+        turned = _turn(sensor.directions(), pose)
+        scan = self._caster.sweep(pose.position_m, turned, sensor.range_m)
+        assert scan.face is not None
+        range_m = np.where(scan.returned, np.linalg.norm(scan.ends_m, axis=1), np.inf)
+        probability = scan.returned.astype(np.float64)
+        losses = ReturnProbability.of(self._scene, sensor)
+        if losses is not None:
+            hit = np.flatnonzero(scan.returned)
+            corners = self._world.triangles_m[scan.face[hit]]
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            cosine = np.abs((normals * turned[hit]).sum(axis=1)) / np.linalg.norm(normals, axis=1)
+            of_solid = solid_reflectivity(kind for _, kind in self._world.solids)
+            reflectivity = of_solid[self._world.solid_of_face[scan.face[hit]]] * cosine
+            probability[hit] = losses(range_m[hit], reflectivity, np.full(len(hit), np.nan))
+        return range_m, probability
 
     def heights_m(self, points_m: FloatArray) -> FloatArray:
         """Return the heights of points (n, 3) of the world frame above the ground, (n,) float64."""
@@ -104,6 +128,11 @@ class StaticWorld:
         ground_m[outside] = nearest(points_m[outside, :2])
         above: FloatArray = points_m[:, 2] - ground_m
         return above
+
+
+def _turn(directions: FloatArray, pose: Pose) -> FloatArray:
+    """Turn directions (n, 3) from the sensor's frame into the world's."""
+    return np.ascontiguousarray(directions @ rotation_world_sensor(*pose.angles_deg).T)
 
 
 def _ground_heights(world: World) -> tuple[LinearNDInterpolator, NearestNDInterpolator] | None:
@@ -178,7 +207,7 @@ class ScanComparison:
     obstacle_directions, obstacle_ranges_m
         Returns of obstacles: unit vectors in the sensor's frame (n, 3), and ranges (n,).
     return_share
-        Share of the beams whose surface is within half the sensor's range that return, as a mean over the scans.
+        Share of the beams whose surface is expected to return that do, as a mean over the scans.
     sectors
         The blocked sectors, by azimuth.
     missing_channels
@@ -240,7 +269,7 @@ def compare_scans(
         A single return that is higher above the ground is not of a vehicle.
     """
     beams = sensor.directions()
-    expected_m = world.ranges_m(pose, beams, sensor.range_m)
+    expected_m, probability = world.expected(pose, sensor)
     points_m = np.concatenate(list(scans))
     scan_of_point = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
     range_m = np.linalg.norm(points_m, axis=1)
@@ -268,7 +297,7 @@ def compare_scans(
     elevation_deg = _elevations_deg(beams)
     returned = np.zeros((len(scans), len(beams)), dtype=np.bool_)
     returned[scan_of_point[on_beam], beam[on_beam]] = True
-    sure = expected_m <= SURE_RANGE * sensor.range_m
+    sure = (expected_m <= SURE_RANGE * sensor.range_m) & (probability >= SURE_PROBABILITY)
     returns = _Returns(beam, range_m, height_m, gap_m)
     sectors = _blocked_sectors(
         azimuth_deg, sure, returned, beam[obstacle], points_m[obstacle], len(scans), pose

@@ -57,6 +57,8 @@ _SHEET_NAME = re.compile(r"installation_.+\.[a-z]+")
 """File name of a sheet."""
 
 _DIGEST_KEY = "sha256"
+_BESIDE_KEY = "beside"
+"""Key of the other files of the same sheet, such as those of another format."""
 _LATITUDE_STEP_DEG = 1e-3
 _PAGE_MM = (210.0, 297.0)
 _STYLE = FigureStyle.for_print(_PAGE_MM[0])
@@ -326,19 +328,26 @@ def write_sheets(
         entries[data.site.name] = {
             **_report_entry(data, path, run_folder), PLANNED_KEY: data.site.name in planned.plan,
         }  # fmt: skip
-    outdated = _outdated_sheets(planned, entries)
+    current, outdated = _earlier_sheets(planned)
+    for name in entries.keys() & current.keys():
+        entries[name][_BESIDE_KEY] = [
+            {key: sheet[key] for key in ("file", "path", _DIGEST_KEY)}
+            for sheet in (current[name], *current[name].get(_BESIDE_KEY, ()))
+            if (sheet["file"], sheet["path"]) != (entries[name]["file"], entries[name]["path"])
+        ]
     add_to_report(run_folder.path, SHEETS, entries, removed=outdated.keys())
     for note in _remove_sheets(outdated, run_folder, folder, [path for _, path in written]):
         on_note(note)
     return written
 
 
-def _outdated_sheets(planned: PlannedSites, entries: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Return the earlier entries that are not of this run and plan, or that new ones replace."""
+def _earlier_sheets(planned: PlannedSites) -> tuple[dict[str, Mapping[str, Any]], dict[str, Mapping[str, Any]]]:
+    """Return the recorded entries of this run and plan, and those of others."""
     folder = planned.run.work.folder
     current = current_sheets(folder, planned.run.record.stages)
     earlier = {name: result.values for name, result in read_results(folder / SHEETS.name).items()}
-    return {name: values for name, values in earlier.items() if name in entries or name not in current}
+    outdated = {name: values for name, values in earlier.items() if name not in current}
+    return {name: values for name, values in earlier.items() if name in current}, outdated
 
 
 def _remove_sheets(
@@ -346,7 +355,7 @@ def _remove_sheets(
 ) -> Iterator[str]:
     """Remove the files of entries that are not among the ``written`` ones; a file that somebody changed stays."""
     removed, changed = [], []
-    for values in outdated.values():
+    for values in (sheet for entry in outdated.values() for sheet in (entry, *entry.get(_BESIDE_KEY, ()))):
         path = run_folder.path / str(values["path"]) if values["path"] else folder / str(values["file"])
         if path in written or not _is_sheet(path, run_folder, folder):
             continue
