@@ -20,8 +20,10 @@ from egvs.extensions import hardware
 from egvs.extensions.hardware.installation import acceptance, acceptance_page, scan_comparison
 from egvs.extensions.hardware.installation.acceptance import Acceptance, PoseError, accept
 from egvs.extensions.hardware.installation.acceptance_limits import Limits
+from egvs.extensions.hardware.installation.planned_sites import PlannedSites
 from egvs.extensions.hardware.installation.scan_comparison import ScanComparison, StaticWorld
 from egvs.extensions.hardware.registration import PARAMETERS, Registration, StaticSurfaces, register_scan
+from egvs.formats import point_clouds
 from egvs.runs.run import FolderInUseError, lock_run_folder
 from egvs.scoring.visibility import Beams
 from egvs.sensors.beam_files import BeamTable
@@ -80,6 +82,29 @@ def test_tilt_error_of_one_and_a_half_degrees_is_measured_within_a_tenth(install
     assert result.pose.position_m < 0.05
     assert failed(result) >= {"tilt", "blocked sectors"}
     assert any(re.match(TILT, reason) for reason in result.reasons)
+
+
+def test_sensor_that_loses_returns_of_the_road_as_planned_is_accepted(tmp_path: Path) -> None:
+    """Sweeps of ``egvs clouds``, with losses and traffic, turned from the level frame into the sensor's."""
+    folder = write_installed_scenario(tmp_path / "crossing")
+    text = (folder / "scenario.toml").read_text()
+    rated = "range_m = 100\nrated_range_m = 60\nrated_reflectivity = 0.8"
+    (folder / "scenario.toml").write_text(text.replace("range_m = 100", rated))
+    scenario = egvs.load(folder)
+    egvs.run(scenario, tmp_path / "run", jobs=1)
+    egvs.write_clouds(scenario, tmp_path / "clouds", sites=["pole_a"], frames=3, format="pcd")
+    pose = PlannedSites.open(tmp_path / "run").site("pole_a").pose
+    turn = rotation_world_sensor(0.0, pose.pitch_deg, pose.roll_deg)
+    scans = []
+    for path in sorted((tmp_path / "clouds").rglob("*.pcd")):
+        scans.append(tmp_path / f"{path.stem}.pcd")
+        point_clouds.write_points(scans[-1], point_clouds.read_points(path, "cloud")[0] @ turn)
+    result = accept(tmp_path / "run", "pole_a", scans)
+    assert (len(scans), result.passed, result.reasons) == (3, True, ())
+    comparison = result.comparison
+    assert comparison.return_share > 0.9
+    near = comparison.expected_m <= scan_comparison.SURE_RANGE * 100.0
+    assert np.isfinite(comparison.measured_m[near]).mean() < 0.9  # what was expected without losses
 
 
 def test_shift_and_turn_are_measured(installed: InstalledRun) -> None:
