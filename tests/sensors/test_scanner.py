@@ -21,7 +21,7 @@ from egvs.core.grid import Roi
 from egvs.formats import point_clouds
 from egvs.formats.georeference import WorldFrame
 from egvs.kernels import embree
-from egvs.sensors.scanner import Scan, Scanner
+from egvs.sensors.scanner import Scan, Scanner, _count_distinct
 from egvs.sensors.scene import Scene
 from egvs.sensors.sites import Pose
 from egvs.stages.inputs import build_scene
@@ -339,3 +339,29 @@ def test_rejects_points_in_degrees(mini: Path) -> None:
         match=r"m.ply: expected metres .*, got longitude and latitude: .*, as degrees 0 m from the region",
     ):
         scan_file(mini, "m.ply")
+
+
+def test_measured_points_count_where_their_beams_can_meet_the_region(mini: Path) -> None:
+    """Points in all directions; the region is 6 m beside the sensor, and farther than its range for some beams."""
+    pose, range_m = Pose(2.0, 3.0, 4.0), 9.0
+    rng = np.random.default_rng(4)
+    directions = rng.normal(size=(400, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    point_clouds.write_points(mini / "points.ply", pose.position_m + directions * rng.uniform(0.5, 9.0, (400, 1)))
+    settings = [
+        "roi.center_m=[12, 3, 2]", "roi.size_m=[8, 8, 4]", "sensors.small.range_m=9", 'sites.points="points.ply"',
+    ]  # fmt: skip
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,2,3,4\n")
+    scene = egvs.build_scene(egvs.load(mini, settings))
+    scan = Scanner(scene).scan_site(scene.sites[0])
+    low, high = np.array([8.0, -1.0, 0.0]), np.array([16.0, 7.0, 4.0])
+    steps = np.linspace(0.0, range_m, 4001)[:, None]
+    meets = [((low <= p) & (p <= high)).all(axis=1).any() for p in pose.position_m + directions[:, None] * steps]
+    difference = set(scan.rows.beam.tolist()) ^ set(np.flatnonzero(meets).tolist())
+    assert 10 < sum(meets) < 200
+    assert len(difference) <= 1, "beams that graze an edge between two samples"
+
+
+@pytest.mark.parametrize("numbers", [[], [3], [3, 3], [0, 1, 2], [0, 0, 5, 5, 5, 9]])
+def test_distinct_numbers_are_counted(numbers: list[int]) -> None:
+    assert _count_distinct(np.array(numbers, dtype=np.uint32)) == len(set(numbers))
