@@ -17,6 +17,7 @@ import argparse
 import ast
 import importlib
 import importlib.machinery
+import itertools
 import json
 import os
 import random
@@ -179,13 +180,14 @@ def fork_tests(
     os._exit(ended)
 
 
-def nearest_first(module: str) -> list[str]:
-    """Return the files of tests of a module's package and its users, those of the module first."""
+def nearest_first(module: str) -> list[list[str]]:
+    """Return the files of tests of a module; those of its package and of its users."""
     package, name = module.rsplit("/", 1)
     packages = (package, *USERS.get(module, ()))
     files = [file for each in packages for file in sorted((ROOT / "tests" / each).rglob("test_*.py"))]
     own = [file for file in files if file.stem.startswith(f"test_{name}")]
-    return [str(file.relative_to(ROOT)) for file in (*own, *(file for file in files if file not in own))]
+    parts = (own, [file for file in files if file not in own])
+    return [[str(file.relative_to(ROOT)) for file in part] for part in parts if part]
 
 
 def try_unchanged(module: str, options: Sequence[str], build: Path) -> tuple[list[str], dict[str, float]]:
@@ -214,10 +216,10 @@ def try_unchanged(module: str, options: Sequence[str], build: Path) -> tuple[lis
 def survivors(module: str, mutants: Sequence[Mutant], build: Path, jobs: int) -> list[Mutant]:
     """Return the mutants of a module with which all tests pass."""
     alive = list(mutants)
-    for marks in ("not slow and not nightly", "slow and not nightly"):
+    for marks, files in itertools.product(("not slow and not nightly", "slow and not nightly"), nearest_first(module)):
         if not alive:
             break
-        options, usual_s = try_unchanged(module, ["-m", marks, *nearest_first(module)], build)
+        options, usual_s = try_unchanged(module, ["-m", marks, *files], build)
         left_out = sum(option.startswith("--deselect") for option in options)
         print(f"  {module}, {marks}: {len(alive)} mutants, {len(usual_s)} tests, {left_out} left out", flush=True)
         waiting, alive = alive[::-1], []

@@ -164,10 +164,12 @@ _BY_SEVERITY = (
         "traffic through solids",
     ),
     ("sites on lanes", "blocked sites", "measured scan", "vehicles off their lanes", "vehicles against lanes"),
+    ("rated range",),
     ("mesh units", "mesh axes", "few beams", "beam angles", "upward beams", "blind sites", "track alignment"),
 )
 """Rules of warnings that make a result worthless or uncertain, that tell of traffic that cannot be, of sites where no
-sensor can stand, and of scenes that are not as they are in reality; all other warnings are less serious."""
+sensor can stand, of a key on which losses of returns depend, and of scenes that are not as they are in reality; all
+other warnings are less serious."""
 
 
 def by_severity(warnings: Iterable[Diagnostic]) -> list[Diagnostic]:
