@@ -4,7 +4,7 @@ usage: python .ci/mutants.py [--sample N] [--seed S] [--jobs N] [MODULE_OR_PACKA
 
 A mutant is one changed operator, number, condition or loop, made by Cosmic Ray. Without arguments all mutants of the
 formula modules are tried; otherwise those of modules or packages, such as `kernels/occupancy` or `scoring`. Each is
-tried on the tests of its own package, the fast ones and those of its module first, in a process that is forked after
+tried on the tests of its module, then on the fast ones of its package, in a process that is forked after
 the libraries were imported. A mutant of a kernel is not compiled: that would take longer than the tests. A test that
 takes more than ten seconds without a mutant, or fails without compiled kernels, is left out. A mutant is killed if a
 test fails or hangs. The others are printed as survivors, but for those
@@ -17,7 +17,6 @@ import argparse
 import ast
 import importlib
 import importlib.machinery
-import itertools
 import json
 import os
 import random
@@ -57,6 +56,7 @@ PYTEST += tuple(f"-Wignore:{start}:RuntimeWarning" for start in ("overflow", "di
 LIBRARIES = ("numpy", "scipy", "shapely", "numba", "pyarrow", "trimesh", "pydantic")
 USERS = {"sensors/scanner": ("effects", "clouds")}
 """Other packages whose tests say what a module must do."""
+FAST, SLOW = "not slow and not nightly", "slow and not nightly"
 PASSED = (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
 LONGEST_TEST_S = 10.0
 SLOWER = 5.0
@@ -186,8 +186,8 @@ def nearest_first(module: str) -> list[list[str]]:
     packages = (package, *USERS.get(module, ()))
     files = [file for each in packages for file in sorted((ROOT / "tests" / each).rglob("test_*.py"))]
     own = [file for file in files if file.stem.startswith(f"test_{name}")]
-    parts = (own, [file for file in files if file not in own])
-    return [[str(file.relative_to(ROOT)) for file in part] for part in parts if part]
+    parts = own, [file for file in files if file not in own]
+    return [[str(file.relative_to(ROOT)) for file in part] for part in parts]
 
 
 def try_unchanged(module: str, options: Sequence[str], build: Path) -> tuple[list[str], dict[str, float]]:
@@ -216,9 +216,10 @@ def try_unchanged(module: str, options: Sequence[str], build: Path) -> tuple[lis
 def survivors(module: str, mutants: Sequence[Mutant], build: Path, jobs: int) -> list[Mutant]:
     """Return the mutants of a module with which all tests pass."""
     alive = list(mutants)
-    for marks, files in itertools.product(("not slow and not nightly", "slow and not nightly"), nearest_first(module)):
-        if not alive:
-            break
+    own, others = nearest_first(module)
+    for marks, files in ((FAST, own), (SLOW, own), (FAST, others)):
+        if not alive or not files:
+            continue
         options, usual_s = try_unchanged(module, ["-m", marks, *files], build)
         left_out = sum(option.startswith("--deselect") for option in options)
         print(f"  {module}, {marks}: {len(alive)} mutants, {len(usual_s)} tests, {left_out} left out", flush=True)
@@ -231,6 +232,7 @@ def survivors(module: str, mutants: Sequence[Mutant], build: Path, jobs: int) ->
             process, status = os.wait()
             if os.waitstatus_to_exitcode(status) in PASSED:
                 alive.append(running[process])
+                print(f"    passes: {running[process].line}: {running[process].change}", flush=True)
             del running[process]
             with suppress(ProcessLookupError):
                 os.killpg(process, signal.SIGKILL)

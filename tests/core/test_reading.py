@@ -61,8 +61,6 @@ def test_only_the_content_of_a_file_makes_it_incomplete(error: Exception, hint: 
         (b'["\\ud800"]', "it is not valid text"),
         ('["駅"]'.encode("cp932"), "it is not utf-8 text: byte 2 is 0x89"),
         (b"{", "Expecting property name"),
-        (b'{"a": NaN}', "NaN is no number in JSON; write null or leave the key out"),
-        (b"[-Infinity]", "-Infinity is no number in JSON"),
     ],
 )
 def test_rejects_invalid_json(tmp_path: Path, data: bytes, message: str) -> None:

@@ -72,17 +72,14 @@ def toml(data: bytes) -> object:
 
 
 def text_json(data: bytes) -> object:
-    """Values; a key that stands there twice, NaN and Infinity are damage."""
+    """Values; a key that stands there twice is damage, NaN and Infinity only where they are read."""
 
     def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         if len({key for key, _ in pairs}) < len(pairs):
             raise ValueError("a key stands there twice")
         return dict(pairs)
 
-    def no_number(name: str) -> Any:
-        raise ValueError(f"{name} is no JSON")
-
-    return json.dumps(json.loads(data.decode(), object_pairs_hook=once, parse_constant=no_number), sort_keys=True)
+    return json.dumps(json.loads(data.decode(), object_pairs_hook=once), sort_keys=True)
 
 
 def xml(data: bytes) -> object:

@@ -16,7 +16,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from egvs.core import limits
 from egvs.core.errors import EgvsError, InputError
@@ -153,9 +153,7 @@ def read_json(
 def parse_json(data: bytes) -> Any:
     """Parse JSON in UTF-8; ValueError or RecursionError when it is not valid."""
     text = data.decode("utf-8-sig")
-    value = json.loads(
-        text, object_pairs_hook=_reject_duplicate_keys, parse_int=_parse_integer, parse_constant=_reject_constant
-    )
+    value = json.loads(text, object_pairs_hook=_reject_duplicate_keys, parse_int=_parse_integer)
     check_depth(value)
     if _SURROGATE.search(text):
         json.dumps(value, ensure_ascii=False).encode("utf-8")
@@ -182,11 +180,6 @@ def _parse_integer(digits: str) -> int:
     if len(digits) > _MAX_DIGITS:
         raise ValueError("a number has too many digits")
     return int(digits)
-
-
-def _reject_constant(name: str) -> NoReturn:
-    """Reject NaN and infinities, which JSON does not have (RFC 8259, section 6) and Python writes."""
-    raise ValueError(f"{name} is no number in JSON; write null or leave the key out")
 
 
 def _nested_containers(value: Any) -> list[Any]:
