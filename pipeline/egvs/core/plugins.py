@@ -11,7 +11,7 @@ https://packaging.python.org/en/latest/specifications/entry-points/
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import Distribution, EntryPoint, EntryPoints, entry_points
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
 from operator import attrgetter
 from typing import Any, TypeVar
@@ -173,8 +173,11 @@ def _entry_points_by_name(group: str) -> dict[str, EntryPoint]:
 
 
 @cache
-def _all_entry_points() -> EntryPoints:
-    """Read the entry points of all groups at once: each reading opens the metadata of every installed package."""
+def _all_entry_points() -> Any:
+    """Read the entry points of all groups at once: each reading opens the metadata of every installed package.
+
+    Returns ``EntryPoints``, or in Python 3.11 a dictionary by group; both have ``select``.
+    """
     return entry_points()
 
 
