@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import io
 import json
@@ -10,6 +11,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from collections.abc import Iterator
@@ -43,15 +45,16 @@ def listening(desk: Client) -> Iterator[http.client.HTTPResponse]:
 
 
 @contextmanager
-def paused_worker() -> Iterator[None]:
-    """Pause the worker of this process."""
+def paused_worker() -> Iterator[int]:
+    """Pause the worker of this process; yields its number."""
     children = chain.from_iterable(path.read_text().split() for path in Path("/proc/self/task").glob("*/children"))
     (worker,) = (pid for pid in map(int, children) if b"desk.worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
     os.kill(worker, signal.SIGSTOP)
     try:
-        yield
+        yield worker
     finally:
-        os.kill(worker, signal.SIGCONT)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(worker, signal.SIGCONT)
 
 
 def next_event(events: http.client.HTTPResponse, name: str) -> dict[str, object]:
@@ -154,10 +157,11 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         assert desk.refused("POST", path, {"site": "pole_a"})[0] == 409
     with listening(desk) as events:
         desk.ok("POST", "/api/run", {})
-        with paused_worker():  # it cannot end meanwhile
+        with paused_worker() as worker:  # it cannot end meanwhile
             assert desk.refused("POST", "/api/run", {})[0] == 409
             assert desk.refused("PATCH", "/api/sites/pole_a", {"z_m": 4})[0] == 409
-        assert desk.ok("POST", "/api/stop", {})["job"]["state"] == "stopped"
+            threading.Timer(1.0, os.kill, (worker, signal.SIGCONT)).start()  # finds the signal to stop
+            assert desk.ok("POST", "/api/stop", {})["job"]["state"] == "stopped"
         assert next_event(events, "job")["state"] == "runs"
         assert desk.refused("POST", "/api/stop", {})[0] == 409
         desk.ok("POST", "/api/run", {})
