@@ -430,7 +430,7 @@ def test_recorded_traffic_is_shown_on_the_map(finished: Any) -> None:
     tab.get_by_role("button", name="Show the traffic on the map").click()
     vehicles.wait_for(state="attached")
     slider = tab.get_by_role("slider", name="Moment")
-    number = int(tab.locator("output[for=moment]").inner_text().split(": ")[1].split()[0])
+    number = int(tab.locator("#moment-text").inner_text().split(": ")[1].split()[0])
     drawn = vehicles.get_attribute("d")
     assert drawn.count("M") == number > 0
     slider.press("ArrowRight")

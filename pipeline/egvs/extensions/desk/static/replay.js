@@ -16,14 +16,15 @@ export function drawReplay() {
   if (replay && replay.ranking !== data.ranking) stopReplay();
   if (!replay) return h("section", {}, button("Show the traffic on the map", start, { key: "replay" }));
   const { traffic, timer } = replay;
-  const text = h("output", { for: "moment", "aria-live": "off" }, describe());
-  const slider = h("input", { id: "moment", type: "range", min: 0, max: traffic.moments.length - 1, step: 1, value: replay.at, "data-key": "moment" });
+  const text = h("p.quiet", { id: "moment-text" }, describe());
+  const slider = h("input", { id: "moment", type: "range", min: 0, max: traffic.moments.length - 1, step: 1, value: replay.at, "data-key": "moment", "aria-describedby": "moment-text" });
   slider.addEventListener("input", () => {
     turnToMoment(Number(slider.value));
     text.textContent = describe();
   });
   return h("section.card", {}, h("h2", {}, "Traffic of this run"),
-    h("div.slider", {}, h("label", { for: "moment" }, "Moment"), slider, text),
+    h("div.slider", {}, h("label", { for: "moment" }, "Moment"), slider),
+    text,
     h("div.tools", {}, button(timer ? "Pause" : "Play", timer ? pause : play, { key: "play" }), button("Hide the traffic", hide, { key: "hide" })));
 }
 
@@ -64,7 +65,7 @@ function play() {
     turnToMoment((replay.at + 1) % replay.traffic.moments.length);
     const slider = document.getElementById("moment");
     if (slider instanceof HTMLInputElement) slider.value = String(replay.at);
-    const text = document.querySelector("output[for=moment]");
+    const text = document.getElementById("moment-text");
     if (text) text.textContent = describe();
   }, 250);
   redraw();
