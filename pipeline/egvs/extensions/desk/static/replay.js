@@ -55,7 +55,7 @@ async function start() {
 function turnToMoment(at) {
   if (!replay) return;
   replay.at = at;
-  mapView().setVehicles(replay.traffic.moments[at].map(([x, y, yaw, length_m, width_m]) => corners([x, y], yaw, length_m, width_m)));
+  mapView().setVehicles(replay.traffic.moments[at].map((/** @type {number[]} */ [x, y, yaw, length_m, width_m]) => corners([x, y], yaw, length_m, width_m)));
 }
 
 function play() {
