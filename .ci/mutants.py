@@ -4,11 +4,11 @@ usage: python .ci/mutants.py [--sample N] [--seed S] [--jobs N] [MODULE_OR_PACKA
 
 A mutant is one changed operator, number, condition or loop, made by Cosmic Ray. Without arguments all mutants of the
 formula modules are tried; otherwise those of modules or packages, such as `kernels/occupancy` or `scoring`. Each is
-tried on the tests of its module, then on the fast ones of its package, in a process that is forked after
-the libraries were imported. A mutant of a kernel is not compiled: that would take longer than the tests. A test that
-takes more than ten seconds without a mutant, or fails without compiled kernels, is left out. A mutant is killed if a
-test fails or hangs. The others are printed as survivors, but for those
-in `.ci/equivalent_mutants.txt`, which says why they compute the same.
+tried on the tests of its module, then on the fast ones of its package, in a process that is forked after the libraries
+were imported. A mutant of a kernel is not compiled: that would take longer than the tests. A test that takes more than
+ten seconds without a mutant, or fails without compiled kernels, is left out. A mutant is killed if a test fails or
+hangs. The others are printed as survivors, but for those in `.ci/equivalent_mutants.txt`, which says why they compute
+the same.
 """
 
 from __future__ import annotations
