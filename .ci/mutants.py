@@ -180,7 +180,7 @@ def fork_tests(
     os._exit(ended)
 
 
-def nearest_first(module: str) -> list[list[str]]:
+def own_and_other_tests(module: str) -> list[list[str]]:
     """Return the files of tests of a module; those of its package and of its users."""
     package, name = module.rsplit("/", 1)
     packages = (package, *USERS.get(module, ()))
@@ -216,7 +216,7 @@ def try_unchanged(module: str, options: Sequence[str], build: Path) -> tuple[lis
 def survivors(module: str, mutants: Sequence[Mutant], build: Path, jobs: int) -> list[Mutant]:
     """Return the mutants of a module with which all tests pass."""
     alive = list(mutants)
-    own, others = nearest_first(module)
+    own, others = own_and_other_tests(module)
     for marks, files in ((FAST, own), (SLOW, own), (FAST, others)):
         if not alive or not files:
             continue

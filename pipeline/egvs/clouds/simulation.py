@@ -478,7 +478,8 @@ class CloudSimulator:
             self._cumulated_weight = _cumulate_weights(self._beam, scan.weight)
         self._weight = scan.weight
         self._static_object = _static_objects(self._scanner.opaque_world, scan) if self._merge else None
-        self._static_cosine, reflectivity = _static_surfaces(self._scanner, scan, directions)
+        assert scan.face is not None
+        self._static_cosine, reflectivity = static_surfaces(self._scanner.opaque_world, scan.face, directions)
         self._intensity = reflectivity * self._static_cosine
 
         self._body_caster = BodyCaster(directions, self._bodies)
@@ -659,22 +660,30 @@ def _static_objects(world: World, scan: EmptyScan) -> IntArray:
     return number
 
 
-def _static_surfaces(scanner: Scanner, scan: EmptyScan, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the cosine of the angle of incidence on the static world along each row, and the reflectivity there.
+def static_surfaces(world: World, face: IntArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how a static world reflects beams.
 
-    Leaves, of any orientation, have a cosine of 1/2.
+    Parameters
+    ----------
+    world
+        The static world.
+    face
+        Face that each beam ends on, (n,) int64; below 0 for leaves, which have any orientation and a cosine of 1/2.
+    directions
+        Unit vectors of the beams, (n, 3).
+
+    Returns
+    -------
+    cosine, reflectivity
+        Cosine of the angle of incidence, and reflectivity of the surface, (n,) float64 each.
     """
-    assert scan.face is not None
-    world = scanner.opaque_world
-    on_face = scan.face >= 0
-    corners = world.triangles_m[scan.face[on_face]]
+    on_face = face >= 0
+    corners = world.triangles_m[face[on_face]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     cosine = np.full(len(directions), 0.5)
     cosine[on_face] = np.abs((normals * directions[on_face]).sum(axis=1)) / np.sqrt((normals**2).sum(axis=1))
     reflectivity = np.full(len(directions), REFLECTIVITY["leaves"])
-    reflectivity[on_face] = solid_reflectivity(kind for _, kind in world.solids)[
-        world.solid_of_face[scan.face[on_face]]
-    ]
+    reflectivity[on_face] = solid_reflectivity(kind for _, kind in world.solids)[world.solid_of_face[face[on_face]]]
     return cosine, reflectivity
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import KDTree
 
-from egvs.clouds.simulation import solid_reflectivity
+from egvs.clouds.simulation import static_surfaces
 from egvs.core.grid import BoolArray, FloatArray, IntArray
 from egvs.effects.returns import ReturnProbability
 from egvs.extensions.hardware.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M
@@ -95,7 +95,7 @@ class StaticWorld:
         scan = self._caster.sweep(pose.position_m, _turn(directions, pose), range_m)
         return np.where(scan.returned, np.linalg.norm(scan.ends_m, axis=1), np.inf)
 
-    def expected(self, pose: Pose, sensor: Sensor) -> tuple[FloatArray, FloatArray]:
+    def expected_returns(self, pose: Pose, sensor: Sensor) -> tuple[FloatArray, FloatArray]:
         """Return the range at which each beam of a sensor ends, and the probability that it returns, (beams,) each.
 
         The probability is that of simulated clouds: by range, reflectivity and angle of incidence. It is 1 where the
@@ -108,13 +108,9 @@ class StaticWorld:
         probability = scan.returned.astype(np.float64)
         losses = ReturnProbability.of(self._scene, sensor)
         if losses is not None:
-            hit = np.flatnonzero(scan.returned)
-            corners = self._world.triangles_m[scan.face[hit]]
-            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            cosine = np.abs((normals * turned[hit]).sum(axis=1)) / np.linalg.norm(normals, axis=1)
-            of_solid = solid_reflectivity(kind for _, kind in self._world.solids)
-            reflectivity = of_solid[self._world.solid_of_face[scan.face[hit]]] * cosine
-            probability[hit] = losses(range_m[hit], reflectivity, np.full(len(hit), np.nan))
+            hit = scan.returned
+            cosine, reflectivity = static_surfaces(self._world, scan.face[hit], turned[hit])
+            probability[hit] = losses(range_m[hit], reflectivity * cosine, np.full(len(cosine), np.nan))
         return range_m, probability
 
     def heights_m(self, points_m: FloatArray) -> FloatArray:
@@ -269,7 +265,7 @@ def compare_scans(
         A single return that is higher above the ground is not of a vehicle.
     """
     beams = sensor.directions()
-    expected_m, probability = world.expected(pose, sensor)
+    expected_m, probability = world.expected_returns(pose, sensor)
     points_m = np.concatenate(list(scans))
     scan_of_point = np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
     range_m = np.linalg.norm(points_m, axis=1)

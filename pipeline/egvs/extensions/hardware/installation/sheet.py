@@ -331,9 +331,9 @@ def write_sheets(
     current, outdated = _earlier_sheets(planned)
     for name in entries.keys() & current.keys():
         entries[name][_BESIDE_KEY] = [
-            {key: sheet[key] for key in ("file", "path", _DIGEST_KEY)}
+            {key: sheet.get(key) for key in ("file", "path", _DIGEST_KEY)}
             for sheet in (current[name], *current[name].get(_BESIDE_KEY, ()))
-            if (sheet["file"], sheet["path"]) != (entries[name]["file"], entries[name]["path"])
+            if (sheet.get("file"), sheet.get("path")) != (entries[name]["file"], entries[name]["path"])
         ]
     add_to_report(run_folder.path, SHEETS, entries, removed=outdated.keys())
     for note in _remove_sheets(outdated, run_folder, folder, [path for _, path in written]):
