@@ -189,11 +189,3 @@ def test_rejects_map_on_another_side_of_the_earth_than_its_origin(tmp_path: Path
     (tmp_path / "map_projector_info.yaml").write_text(origin, encoding="utf-8")
     with pytest.raises(InputError, match="its points are on another side of the Earth than the origin"):
         project(path)
-
-
-def test_rejects_map_whose_points_are_all_far_from_their_middle(tmp_path: Path) -> None:
-    path = square_map().write(tmp_path / "map.osm")
-    text = re.sub(r'(<node id="[12]" lat="[^"]*" lon=")[^"]*', r"\g<1>-170", path.read_text(encoding="utf-8"))
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=r"its points are on another side of the Earth|from the middle of the map"):
-        project(path)
