@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import math
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -103,8 +103,20 @@ def place(
     caveats = [sections.describe_missing_traffic(collect_warnings([traffic])), sections.main_assumptions(assumed)]
     if placed.fused is not None and placed.fused.noticed is not None:
         caveats.append(sensor_text.upper_limit_note(loaded, [sensor.sensor for sensor in placed.sensors]))
+    caveats.append(_describe_unplaced_sensors(loaded, {site.sensor for site in sites.candidate_sites(loaded)}))
     found, has_relief = _plan_level(loaded, folder, placed), sites.has_relief(loaded)
     print_placement(placed, notes, [caveat for caveat in caveats if caveat], found, has_relief=has_relief)
+
+
+def _describe_unplaced_sensors(scenario: Scenario, placeable: Collection[str]) -> str:
+    """Return which sensors have a price but no candidate site, so that no plan can have them; empty if none."""
+    unplaced = [name for name in scenario.costs.sensor if name not in placeable]
+    if not unplaced:
+        return ""
+    from egvs.results.labels import join_names
+
+    file = scenario.sites.file or "a file of sites"
+    return f"No plan has {join_names(unplaced)}: for that, each needs rows in {file} with its name in the column sensor."
 
 
 def _plan_level(scenario: Scenario, folder: Path, placed: SensorPlan) -> DetectionLevel:
