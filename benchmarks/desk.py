@@ -1,8 +1,9 @@
-"""What the desk takes: start, the first click, a dragged pole with and without scores, and the memory of the server.
+"""What the desk takes: start, the first click, a dragged pole with and without scores, 3D, and the server's memory.
 
 ``python -m benchmarks.desk [--poles 300] [--moves 60]`` serves a folder with the shipped junction, all poles around its
-candidates, and a finished run, and drags a pole in Chromium (needs ``egvs[desk]``, playwright and Chromium). A move is
-shown when the browser has painted the frame after it.
+candidates, and a finished run, and drags a pole in Chromium (needs ``egvs[desk,explore]``, playwright and Chromium). A
+move is shown when the browser has painted the frame after it. With scores, 200 made-up vehicles are on the map. 3D
+shows a pole when the browser has painted twice after the last message of the explorer's server.
 """
 
 from __future__ import annotations
@@ -32,9 +33,12 @@ LIMITS = {
     "first answer, s": "1.5", "first click, s": "2.5", "move shown without scores, ms": "60 (95 %: 120)",
     "move shown with scores, ms": "60 (95 %: 120)", "new score of a move, ms": "120 (95 %: 200)",
     "score of the last position, ms": "250", "memory beyond the scenario's, MB": "120",
+    "3D after a drag, ms": "500 (95 %: 1000)",
 }  # fmt: skip
+VEHICLES = 200
 WATCH = """() => {
-  window.shown = { moves: [], scores: [], last: 0 };
+  window.shown = { moves: [], scores: [], last: 0, dropped: 0 };
+  addEventListener("pointerup", () => { shown.dropped = performance.timeOrigin + performance.now(); }, true);
   const bubble = document.querySelector(".bubble");
   addEventListener("pointermove", (event) => {
     shown.last = performance.now();
@@ -45,6 +49,19 @@ WATCH = """() => {
   new MutationObserver(() => {
     if (/rank \\d/.test(bubble.textContent)) shown.scores.push(performance.now() - shown.last);
   }).observe(bubble, { subtree: true, childList: true, characterData: true });
+}"""
+
+WATCH_3D = """if (window !== top) {
+  window.painted = 0;
+  const twice = (then) => requestAnimationFrame(() => requestAnimationFrame(then));
+  window.Worker = class extends Worker {  // has the connection to the explorer's server
+    constructor(...words) {
+      super(...words);
+      this.addEventListener("message", () => twice(() => { const painted = new MessageChannel();
+        painted.port1.onmessage = () => { window.painted = performance.timeOrigin + performance.now(); };
+        painted.port2.postMessage(0); }));
+    }
+  };
 }"""
 
 
@@ -111,15 +128,20 @@ def scenario_mb(run: Path) -> float:
 
 
 def open_scenario(tab: Any, name: str) -> None:
-    """Open a scenario on the start page, and take hold of the pole that is drawn above all others."""
+    """Open a scenario on the start page."""
     tab.get_by_title(f"Open {name}").click()
-    pole = tab.locator(".item.pole .body").last
-    pole.wait_for()
+    tab.locator(".item.pole .body").last.wait_for()
     tab.wait_for_timeout(2000)
     tab.evaluate(WATCH)
-    box = pole.bounding_box()
-    tab.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+
+
+def take_hold(tab: Any) -> tuple[float, float]:
+    """Take hold of the pole that is drawn above all others; return its place on the page."""
+    box = tab.locator(".item.pole .body").last.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    tab.mouse.move(x, y)
     tab.mouse.down()
+    return x, y
 
 
 def drag(tab: Any, moves: int, pause_ms: float) -> dict[str, list[float]]:
@@ -135,6 +157,37 @@ def drag(tab: Any, moves: int, pause_ms: float) -> dict[str, list[float]]:
     return found
 
 
+def show_vehicles(tab: Any) -> None:
+    """Let the map show vehicles at random places of the region of interest, instead of the few that were recorded."""
+    rng = np.random.default_rng(2)
+    x_m, y_m, yaw_rad = rng.uniform(160, 220, VEHICLES), rng.uniform(220, 290, VEHICLES), rng.uniform(-3, 3, VEHICLES)
+    moment = np.column_stack([x_m, y_m, yaw_rad, np.full(VEHICLES, 4.5), np.full(VEHICLES, 1.8)])
+    answer = {"moments": [moment.round(2).tolist()] * 2, "first_s": 0.0, "period_s": 0.5}
+    tab.route("**/api/traffic", lambda route: route.fulfill(response=route.fetch(), json=answer))
+    tab.get_by_role("button", name="Run").first.click()
+    tab.get_by_role("button", name="Show the traffic on the map").click()
+    tab.get_by_text(f"{VEHICLES} road users").wait_for()
+
+
+def three_after_drags_ms(tab: Any, drags: int) -> list[float]:
+    """Return how long after the end of a drag the 3D view was painted for the last time."""
+    tab.mouse.up()
+    tab.get_by_role("button", name="3D", exact=True).click()
+    tab.locator("section.three iframe").wait_for(timeout=60_000)
+    tab.wait_for_timeout(10_000)
+    frame = tab.frames[-1]
+    times = []
+    for number in range(drags + 1):
+        x, y = take_hold(tab)
+        tab.mouse.move(x + (6, -6)[number % 2], y, steps=3)
+        tab.mouse.up()
+        if number == 0:
+            tab.get_by_role("dialog").get_by_role("button", name="Change", exact=True).click()
+        tab.wait_for_timeout(3000)
+        times.append(frame.evaluate("painted") - tab.evaluate("shown.dropped"))
+    return times[1:]  # before the first one, the page asks
+
+
 @contextmanager
 def opened(folder: Path) -> Iterator[tuple[subprocess.Popen[str], Any, float]]:
     """Serve a folder and open it in a browser; yields the server, the tab, and the seconds until it can be clicked."""
@@ -142,6 +195,7 @@ def opened(folder: Path) -> Iterator[tuple[subprocess.Popen[str], Any, float]]:
         path = shutil.which("chromium") or shutil.which("chromium-browser")
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
         tab = browser.new_page(viewport={"width": 1280, "height": 800})
+        tab.add_init_script(WATCH_3D)
         begin = time.perf_counter()
         with server(folder) as (process, address):
             tab.goto(address)
@@ -156,16 +210,21 @@ def measure(folder: Path, moves: int) -> Iterator[tuple[str, list[float]]]:
     with opened(folder) as (_, tab, clickable_s):
         yield "first click, s", [clickable_s]
         open_scenario(tab, "plain")
+        take_hold(tab)
         yield "move shown without scores, ms", drag(tab, moves, 30.0)["moves"]
     with opened(folder) as (process, tab, _):
         open_scenario(tab, "shinjuku")
+        show_vehicles(tab)
+        take_hold(tab)
         drag(tab, 3, 0.0)  # reads the run
         tab.locator(".bubble", has_text=", rank ").wait_for(timeout=120_000)
         found = drag(tab, moves, 400.0)
         yield "move shown with scores, ms", found["moves"]
         yield "new score of a move, ms", found["scores"]
         yield "score of the last position, ms", [drag(tab, moves, 0.0)["scores"][-1] for _ in range(3)]
-        yield "memory beyond the scenario's, MB", [memory_mb(process.pid) - scenario_mb(folder / "runs" / "shinjuku")]
+        used_mb = memory_mb(process.pid)
+        yield "3D after a drag, ms", three_after_drags_ms(tab, 10)
+    yield "memory beyond the scenario's, MB", [used_mb - scenario_mb(folder / "runs" / "shinjuku")]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

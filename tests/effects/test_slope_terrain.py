@@ -60,6 +60,18 @@ def test_ground_is_the_terrain_beyond_the_roads(flat_road: Path, tmp_path: Path)
     assert np.ptp(flat.vertices_m[:, 2]) == 0
 
 
+def test_heights_beside_repeated_points_are_those_of_the_plane() -> None:
+    """SciPy does not say which triangles are at repeated points."""
+    rng = np.random.default_rng(5)
+    xy_m = rng.uniform(0, 10, (8, 2))[rng.integers(8, size=200)]
+    points_m = np.column_stack([np.concatenate([xy_m, [[0, 0], [10, 0], [0, 10], [10, 10]]]), np.zeros(204)])
+    points_m[:, 2] = 0.1 * points_m[:, 0] - 0.2 * points_m[:, 1] + 3
+    low_m, high_m = np.zeros(2), np.full(2, 10.0)
+    ground = terrain.TerrainSurface(points_m, terrain.triangulate(points_m, low_m), low_m, high_m)
+    x_m, y_m = rng.uniform(0.01, 9.99, (2, 500))
+    assert ground.height_m(x_m, y_m) == pytest.approx(0.1 * x_m - 0.2 * y_m + 3, abs=1e-9)
+
+
 @pytest.mark.system
 def test_lanes_far_above_the_terrain_are_no_ground(hill_road: Path) -> None:
     """The hill road rises to 12 m over a terrain at z = 0: where it is more than 1.5 m above, it is a bridge."""

@@ -115,7 +115,9 @@ class TerrainSurface:
         """
         mesh = self._triangulation
         points = self.vertices_m[:, :2] - self.low_m
-        face = np.maximum(mesh.vertex_to_simplex[_nearest(points, at)], 0).astype(np.int64)
+        first = mesh.vertex_to_simplex.copy()
+        first[mesh.coplanar[:, 0]] = mesh.coplanar[:, 1]  # of repeated points, SciPy has the number of a vertex there
+        face = np.maximum(first[_nearest(points, at)], 0).astype(np.int64)
         shares = _barycentric(points[mesh.simplices[face]], at)
         active = np.arange(len(at))
         for _ in range(len(mesh.simplices)):

@@ -135,6 +135,12 @@ def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:
     desk.ok("POST", "/api/plan", {"count": 99})
     assert "at most" in desk.wait("failed")["message"]
 
+    trajectories = tmp_path / "work" / "runs" / "town" / "trajectories.parquet"
+    kept = trajectories.read_bytes()
+    trajectories.write_bytes(kept[:100])
+    assert desk.refused("GET", "/api/traffic")[0] == 409
+    trajectories.write_bytes(kept)
+
     for name, begin in (("gpkg", b"SQLite"), ("sheets", b"PK"), ("csv", b"PK")):
         desk.ok("POST", f"/api/downloads/{name}", {})
         url = desk.wait()["result"]["url"]

@@ -49,6 +49,22 @@ def _close_pipes(process: subprocess.Popen[str]) -> None:
                 pipe.close()
 
 
+def ask_worker(request: dict[str, Any]) -> dict[str, Any]:
+    """Return the result of a short job, so that what it loads leaves the memory; RefusalError if there is none."""
+    process = start_worker(request)
+    assert process.stdout is not None and process.stderr is not None
+    messages = [json.loads(line) for line in process.stdout]
+    process.wait()
+    log = process.stderr.read().splitlines()
+    _close_pipes(process)
+    end = messages[-1] if messages else {}
+    if "result" not in end:
+        unexplained = log[-1] if log else f"it ended with code {process.returncode}"
+        raise RefusalError(409, end.get("error", unexplained), end.get("hint", ""))
+    result: dict[str, Any] = end["result"]
+    return result
+
+
 class Job:
     """A job and its state.
 

@@ -32,7 +32,7 @@ from egvs.creation.assumed_traffic import TRAFFIC_LEVELS
 from egvs.extensions.desk import aerial, downloads, obstacles, results_view
 from egvs.extensions.desk.aerial import AerialPicture
 from egvs.extensions.desk.events import Events
-from egvs.extensions.desk.jobs import Job, LiveScores
+from egvs.extensions.desk.jobs import Job, LiveScores, ask_worker
 from egvs.extensions.desk.project import KEEP_RESULTS, Project
 from egvs.extensions.desk.refusals import RefusalError, parse_number, require_text
 from egvs.extensions.desk.workspace import DroppedMap, Workspace, map_suffixes
@@ -432,7 +432,7 @@ class Desk:
 
     def show_traffic(self, _body: Body) -> Answer:
         """Return some moments of the recorded traffic."""
-        return results_view.describe_traffic(self._finished_run())
+        return ask_worker({"kind": "traffic", "run": str(self._finished_run())})
 
     def show_plan(self, _body: Body) -> Answer:
         """Return the plan."""

@@ -209,6 +209,13 @@ def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str,
     return {"text": [answer.conclusion(), *result.notes], "sites": rows}
 
 
+def describe_traffic(_progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
+    """Describe the recorded traffic of a run for the map."""
+    from egvs.extensions.desk import results_view
+
+    return results_view.describe_traffic(Path(request["run"]))
+
+
 def run_command(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
     """Run a command of the command line."""
     from egvs.cli.app import app
@@ -251,6 +258,7 @@ def rate_poses(send: Send, request: dict[str, Any]) -> dict[str, Any]:
 JOBS: dict[str, Callable[[Progress, dict[str, Any]], dict[str, Any]]] = {
     "junctions": list_junctions, "download": download_map, "new": create, "run": run_stages, "plan": plan,
     "additions": describe_additions, "trial": try_sensor, "what_if": evaluate_obstacles, "export": run_command,
+    "traffic": describe_traffic,
 }  # fmt: skip
 """What each kind of job calls."""
 
