@@ -88,7 +88,7 @@ def main() -> None:
     given = parser.parse_args()
     print(HEADING.format("error of 0.1 m and 1°"))
     for path in given.scenarios:
-        scenario = egvs.load(path, [f"traffic.frames={TRAFFIC_FRAMES}"])
+        scenario = egvs.load(path, [f"traffic.frames={TRAFFIC_FRAMES}", "effects.range_limit=false"])
         out = given.out / scenario.name
         score = planned_scores(scenario, out)
         planned = SiteDetections.measure(scenario, out, given.frames)
