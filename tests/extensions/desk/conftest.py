@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import tomlkit
 
 from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
 from tests.conftest import write_mini
@@ -40,6 +42,22 @@ def desk(tmp_path: Path) -> Iterator[Client]:
     write_mini(folder / "mini")
     with serving(folder, tmp_path / "scratch") as client:
         yield client
+
+
+def write_inline_plan(town: Path) -> None:
+    """Write the plan of the town's signal into scenario.toml, in place of its table."""
+    toml = tomlkit.parse((town / "scenario.toml").read_text())
+    (plan,) = toml["traffic"]["signals"].values()
+    with (town / plan.pop("file")).open() as rows:
+        table = list(csv.DictReader(rows))
+    plan["phases"] = [
+        {
+            "green_s": float(next(row["green_s"] for row in table if row["phase"] == number)),
+            "green": {row["approach"]: row["movement"].split() for row in table if row["phase"] == number},
+        }
+        for number in dict.fromkeys(row["phase"] for row in table)
+    ]
+    (town / "scenario.toml").write_text(tomlkit.dumps(toml))
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from egvs.extensions.desk.server import STATIC
 from tests.accessibility import violations
 from tests.chromium import SOFTWARE_GRAPHICS, needs_chromium, open_chromium
 from tests.conftest import write_mini
-from tests.extensions.desk.conftest import MAP, write_periods
+from tests.extensions.desk.conftest import MAP, write_inline_plan, write_periods
 from tests.extensions.desk.serving import serving
 from tests.extensions.desk.test_aerial import write_picture
 
@@ -494,7 +494,7 @@ def test_change_that_is_not_agreed_to_is_taken_back(finished: Any) -> None:
     assert tab.get_by_role("button", name="Undo").is_disabled()
 
 
-def test_signal_times_are_typed_at_the_bars(town: Any) -> None:
+def test_signal_times_are_typed_at_the_bars(town: Any, folder: Path) -> None:
     go(town, "Traffic")
     diagram = town.get_by_role("img", name="Cycle of")
     assert diagram.locator("rect.green").count() == 4
@@ -511,6 +511,9 @@ def test_signal_times_are_typed_at_the_bars(town: Any) -> None:
     assert_accessible(town)
     town.keyboard.press("Control+z")
     wait_until(town, lambda: [phase["green_s"] for phase in state(town)["project"]["signals"][0]["phases"]] == times)
+    write_inline_plan(folder / "town")
+    town.get_by_text("is in scenario.toml; edit it there.").wait_for(timeout=JOB_MS)
+    assert diagram.count() == 0
 
 
 def test_counts_are_typed_by_period(folder: Path, made_town: Path, open_page: Callable[..., Any]) -> None:

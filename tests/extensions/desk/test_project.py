@@ -12,7 +12,7 @@ from egvs.extensions.desk.project import CsvTable
 from egvs.extensions.desk.refusals import RefusalError, parse_number
 from egvs.scenario.loading import load
 from egvs.sensors.sites import candidate_sites
-from tests.extensions.desk.conftest import write_periods
+from tests.extensions.desk.conftest import write_inline_plan, write_periods
 from tests.extensions.desk.serving import Client
 
 pytestmark = pytest.mark.system  # a junction is made from a map
@@ -290,6 +290,11 @@ def test_signals_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
     assert town.refused("PUT", "/api/signals", {**times, "green_s": []})[0] == 422
     assert town.refused("PUT", "/api/signals", {**times, "yellow_s": "short"})[::2] == (422, "yellow_s")
     assert town.refused("PUT", "/api/signals", {**times, "name": "no"})[0] == 409
+    write_inline_plan(tmp_path / "work" / "town")
+    town.ok("GET", "/api/map")
+    (other,) = town.project["signals"]
+    assert (other["name"], other["file"], other["phases"]) == (signal["name"], "scenario.toml", [])
+    assert town.refused("PUT", "/api/signals", {**times, "green_s": []})[0] == 409
 
 
 def test_counts_of_a_period_are_in_its_table(town: Client, tmp_path: Path) -> None:

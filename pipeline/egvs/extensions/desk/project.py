@@ -488,8 +488,8 @@ class Project:
             self.refresh()
             signal = {each["name"]: each for each in self._describe_signals()}.get(str(body.get("name")))
             greens = body.get("green_s")
-            if signal is None:
-                raise RefusalError(409, self._problem or "there is no such signal")
+            if signal is None or not signal["phases"]:
+                raise RefusalError(409, self._problem or "there is no table of such a signal")
             if not isinstance(greens, list) or len(greens) != len(signal["phases"]):
                 raise RefusalError(422, f"expected {len(signal['phases'])} green times", "", "green_s")
             document = tomlkit.parse(self._contents[SCENARIO_FILE])

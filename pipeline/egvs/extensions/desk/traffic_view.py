@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from egvs.core.numbers import number_or_nan
-from egvs.scenario.model import Scenario
+from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.traffic import capacity
 from egvs.traffic.approach_names import approach_name
@@ -63,7 +63,7 @@ def _nearer_end(edge: Edge, x_m: float, y_m: float) -> list[float]:
 
 
 def describe_signals(scenario: Scenario, tables: dict[str, list[dict[str, str]]]) -> list[dict[str, Any]]:
-    """Return the plans of signals that are in tables.
+    """Return the plans of signals; those that are not in a table have no phases here.
 
     Parameters
     ----------
@@ -82,10 +82,11 @@ def describe_signals(scenario: Scenario, tables: dict[str, list[dict[str, str]]]
                 "name": row.get("phase", ""), "green_s": number_or_nan(row.get("green_s", "")), "green": [],
             })  # fmt: skip
             phase["green"].append({"approach": row.get("approach", ""), "turns": row.get("movement", "").split()})
-        if not phases or not all(math.isfinite(phase["green_s"]) for phase in phases.values()):
-            continue
+        if not all(math.isfinite(phase["green_s"]) for phase in phases.values()):
+            phases = {}
         described.append({
-            "name": name, "title": title or name, "file": plan.file, "assumed": ASSUMED_PLANS in scenario.assumed,
+            "name": name, "title": title or name, "file": plan.file or SCENARIO_FILE,
+            "actuated": plan.type == "actuated", "assumed": ASSUMED_PLANS in scenario.assumed,
             "yellow_s": plan.yellow_s, "all_red_s": plan.all_red_s, "phases": list(phases.values()),
         })  # fmt: skip
     return described

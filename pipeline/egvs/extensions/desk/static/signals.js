@@ -15,9 +15,12 @@ const TOP = 16;
 let shown = [];
 
 export function drawSignals() {
-  shown = data.project.signals.map((/** @type {any} */ signal) => ({ signal: structuredClone(signal), bars: h("div") }));
+  const [editable, others] = [true, false].map((isEditable) => data.project.signals.filter((/** @type {any} */ { phases }) => isEditable === phases.length > 0));
+  shown = editable.map((/** @type {any} */ signal) => ({ signal: structuredClone(signal), bars: h("div") }));
   showBars();
-  return shown.length > 0 && h("section", {}, shown.map(({ signal, bars }) => signalCard(signal, bars)));
+  return data.project.signals.length > 0 && h("section", {},
+    shown.map(({ signal, bars }) => signalCard(signal, bars)),
+    others.length > 0 && h("section.card", {}, h("h2", {}, shown.length ? "Other signals" : "Signals"), others.map((/** @type {any} */ { title, file }) => h("p.quiet", {}, `The plan of ${title} is in ${file}; edit it there.`))));
 }
 
 /** Draw the bars for the numbers that are being typed. */
@@ -35,7 +38,7 @@ function signalCard(signal, bars) {
   const columns = h("div.stages", {}, signal.phases.map((/** @type {any} */ phase, /** @type {number} */ number) => h("div", {}, stage(phase), time(signal, number))));
   columns.style.gridTemplateColumns = lengthsOf(signal).map((/** @type {number} */ length) => `minmax(4.75rem, ${length}fr)`).join(" ");
   return h("section.card", {}, h("h2", {}, "Signals"),
-    h("p.quiet", {}, !/^\d+$/.test(signal.title) && `${signal.title}. `, signal.assumed && "Times that you have not typed are assumed."),
+    h("p.quiet", {}, !/^\d+$/.test(signal.title) && `${signal.title}. `, signal.assumed && "Times that you have not typed are assumed.", signal.actuated && " Green lasts longer while vehicles arrive, so that the cycle changes."),
     columns, bars,
     h("div.pair", {}, time(signal, "yellow_s"), time(signal, "all_red_s")));
 }
