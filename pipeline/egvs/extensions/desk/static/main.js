@@ -18,10 +18,13 @@ import { drawThree } from "./three.js";
 /** Steps that were left for another one. @type {Set<string>} */
 const visited = new Set();
 
+/** Whether a step was left, now or before a run. @param {string} id @param {any} project */
+const wasLeft = (id, project) => visited.has(id) || project.run.state !== "none";
+
 /** @type {{id: string, title: string, isOptional?: boolean, draw: (panel: HTMLElement) => void, isDone: (project: any) => boolean}[]} */
 const STEPS = [
-  { id: "poles", title: "Poles", isOptional: true, draw: drawPoles, isDone: (project) => project.sites.length > 0 && visited.has("poles") },
-  { id: "traffic", title: "Traffic", isOptional: true, draw: drawCounts, isDone: (project) => project.counts.some((/** @type {any} */ period) => period.total_per_h > 0) && visited.has("traffic") },
+  { id: "poles", title: "Poles", isOptional: true, draw: drawPoles, isDone: (project) => project.sites.length > 0 && wasLeft("poles", project) },
+  { id: "traffic", title: "Traffic", isOptional: true, draw: drawCounts, isDone: (project) => project.counts.some((/** @type {any} */ period) => period.total_per_h > 0) && wasLeft("traffic", project) },
   { id: "run", title: "Run", draw: drawRun, isDone: (project) => project.run.state === "complete" },
   { id: "plan", title: "Decide", draw: drawPlan, isDone: (project) => project.run.has_plan && !project.run.plan_outdated },
   { id: "take", title: "Take along", draw: drawTake, isDone: () => false },
