@@ -339,11 +339,14 @@ def read_streets(path: Path) -> Streets:
     return Streets(network, areas, tuple(junctions), tuple(large_rings))
 
 
-def unusable_network(error: InputError, path: Path, road_map: Path) -> InputError:
-    """Return an error about a network that was made from a map as one about the map, and other errors as they are."""
-    if not error.where.startswith(str(path)):
+def unusable_network(error: InputError, folder: Path, road_map: Path) -> InputError:
+    """Return an error about a network that was made from a map as one about the map, and other errors as they are.
+
+    ``folder`` has the network.
+    """
+    if not error.where.startswith(str(folder)):
         return error
-    element = error.where.removeprefix(str(path)).removeprefix(": ")
+    element = error.where.removeprefix(str(folder)).partition(": ")[2]
     problem = f"{element}: {error.problem}" if element else error.problem
     return InputError(road_map, f"the network cannot be used: {problem}", "Correct its roads.")
 

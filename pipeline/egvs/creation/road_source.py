@@ -76,7 +76,7 @@ def network_file(network: str, road_map: Path) -> Iterator[Path]:
         try:
             yield folder / NETWORK_FILE
         except InputError as error:
-            raise junctions.unusable_network(error, folder / NETWORK_FILE, road_map) from None
+            raise junctions.unusable_network(error, folder, road_map) from None
 
 
 @dataclass(frozen=True)

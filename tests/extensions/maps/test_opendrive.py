@@ -564,6 +564,14 @@ def test_limit_of_netconvert_says_nothing_against_the_map(tmp_path: Path, monkey
 
 
 @pytest.mark.system
+def test_network_that_cannot_be_read_names_the_map(tmp_path: Path) -> None:
+    steep = '<elevation s="0" a="0" b="0" c="2147483648" d="0"/>'
+    with pytest.raises(InputError) as error:
+        convert(tmp_path, maps.opendrive(road("7", 100, geometry(0, 0, 0, 100), section([lane(-1)]), elevation=steep)))
+    assert str(error.value).startswith(f"{tmp_path / 'map.xodr'}: the network cannot be used: lane ")
+
+
+@pytest.mark.system
 def test_light_where_two_roads_join_is_none(tmp_path: Path) -> None:
     """It governs no conflicting movements; netconvert would stop cars at the joint, and at the end of the road."""
     light = '<signal id="s1" s="98" t="5" dynamic="yes" orientation="+" type="1000001" subtype="-1"/>'

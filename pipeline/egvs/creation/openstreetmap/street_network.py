@@ -173,7 +173,7 @@ def build_network(
             if isinstance(error, sumo.SumoInputError):
                 raise error.for_input(osm, "netconvert cannot use the streets", "Choose another extract.") from None
             if isinstance(error, InputError):
-                raise junctions.unusable_network(error, folder / NETWORK_FILE, osm) from None
+                raise junctions.unusable_network(error, folder, osm) from None
             raise
         text = (folder / NETWORK_FILE).read_text(encoding="utf-8")
 

@@ -25,6 +25,7 @@ import numpy as np
 from egvs.core import files, limits
 from egvs.core.errors import InputError
 from egvs.core.wording import by_number, list_first, number_of
+from egvs.creation import junctions
 from egvs.creation.driving_side import DrivingSide, Evidence, choose_side, majority, side_in_frame
 from egvs.creation.map_parts import RoadMap, RoadOptions
 from egvs.creation.terrain import draping, network_heights
@@ -92,18 +93,17 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         keeps_type=_import_all if options.walk else is_driving,
         keeps_all_lights=options.walk,
     )
-    with files.temporary_folder() as folder:
+    with _conversion(path) as folder:
         write_copy(path, road_map, folder / _MAP, copy_options)
         copied = _read_copy(folder / _MAP, path)
         flags = [*_FLAGS, *(["--lefthand"] if lefthand else []), *([] if reference else [_OWN_FRAME_FLAG])]
         if options.walk:
             flags.append("--opendrive.import-all-lanes")
-        with _netconvert_errors(path):
-            sumo.run_netconvert(["--opendrive-files", _MAP, *flags], folder, _NETWORK)
+        sumo.run_netconvert(["--opendrive-files", _MAP, *flags], folder, _NETWORK)
 
         made = read_made_network(folder / _NETWORK)
         comparison = compare_with_map(made, copied, mirrored=lefthand)
-        name = _patch(folder, made, comparison, options, path)
+        name = _patch(folder, made, comparison, options)
         after = comparison
         if name != _NETWORK:
             after = compare_with_map(read_made_network(folder / name), copied, mirrored=lefthand)
@@ -211,16 +211,19 @@ def _projection(road_map: OpenDriveMap, path: Path) -> tuple[str, tuple[str, ...
 
 
 @contextmanager
-def _netconvert_errors(path: Path) -> Iterator[None]:
-    """Raise netconvert's errors as those of a map."""
-    try:
-        yield
-    except sumo.SumoInputError as error:
-        hint = "Correct the map, or export it again."
-        raise error.for_input(path, "netconvert cannot use the map", hint) from None
+def _conversion(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder; raise netconvert's errors there, and those of its networks, as errors of a map."""
+    with files.temporary_folder() as folder:
+        try:
+            yield folder
+        except sumo.SumoInputError as error:
+            hint = "Correct the map, or export it again."
+            raise error.for_input(path, "netconvert cannot use the map", hint) from None
+        except InputError as error:
+            raise junctions.unusable_network(error, folder, path) from None
 
 
-def _patch(folder: Path, made: MadeNetwork, comparison: MapComparison, options: RoadOptions, path: Path) -> str:
+def _patch(folder: Path, made: MadeNetwork, comparison: MapComparison, options: RoadOptions) -> str:
     """Add missing connections, remove others, and close lanes; return the name of the resulting network."""
     added = [
         Connection(source.edge, source.index, target.edge, target.index)
@@ -235,8 +238,7 @@ def _patch(folder: Path, made: MadeNetwork, comparison: MapComparison, options: 
     if edges:
         (folder / _EDGE_PATCH).write_text(_element("edges", edges), encoding="utf-8")
         flags += ["-e", _EDGE_PATCH, *_WALK_FLAGS]
-    with _netconvert_errors(path):
-        patch_network(folder, _NETWORK, _PATCHED, removed=removed, added=added, flags=flags)
+    patch_network(folder, _NETWORK, _PATCHED, removed=removed, added=added, flags=flags)
     return _PATCHED
 
 
