@@ -109,7 +109,7 @@ def test_patch_removes_connections(tmp_path: Path) -> None:
     found = compare_with_map(made, read_opendrive(tmp_path / "map.xodr"), mirrored=False)
     wrong = replace(found, added=(("-1", 0, "-2", 0),))
     (tmp_path / "network.net.xml").write_bytes((tmp_path / "net.net.xml").read_bytes())
-    name = opendrive._patch(tmp_path, made, wrong, RoadOptions(), tmp_path / "map.xodr")
+    name = opendrive._patch(tmp_path, made, wrong, RoadOptions())
     patched = network.read_net_xml(tmp_path / name)
     assert turns(patched) == {("-1", 1, "-2", 0)} == turns(roads) - {("-1", 0, "-2", 0)}
 
