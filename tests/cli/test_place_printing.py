@@ -261,13 +261,11 @@ def test_files_come_last(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_sensor_with_a_price_and_no_site_is_named(mini: Path, run_egvs: Any) -> None:
-    scenario, sites = mini / "scenario.toml", mini / "sites.csv"
+    scenario = mini / "scenario.toml"
     scenario.write_text(scenario.read_text() + '\n[costs]\nsensor = { small = 8000, "OS1-64" = 12000 }\n')
-    sites.write_text("site,x_m,y_m,z_m,sensor\na,10,12,3,\nb,30.5,-12,3,\n")
     request = ("place", mini, "--budget", "20000", "--out", mini / "out")
     code, text, _ = run_egvs(*request)
-    assert code == 0 and "No plan has OS1-64: for that, each needs rows in sites.csv with" in " ".join(text.split())
-    with sites.open("a") as rows:
-        rows.write("other,10,12,3,OS1-64\n")
+    assert code == 0 and "No plan has OS1-64: add it to sites.sensor." in " ".join(text.split())
+    scenario.write_text(scenario.read_text().replace('sensor = "small"', 'sensor = ["small", "OS1-64"]'))
     code, text, _ = run_egvs(*request)
     assert code == 0 and "No plan has" not in text

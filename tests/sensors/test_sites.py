@@ -284,6 +284,49 @@ def test_accepts_sensor_that_the_rows_name_too(mini: Path) -> None:
     assert [site.sensor for site in sites_from(mini, rows, sensor="VLP-16")] == ["VLP-16"]
 
 
+def test_each_sensor_of_a_list_is_a_candidate_of_rows_without_their_own(mini: Path) -> None:
+    result = sites_from(mini, MIXED_SENSORS, sensor='["VLP-32C", "AT128"]', pitch_deg="[0, -5]")
+    assert [(site.name, site.sensor, site.pole) for site in result] == [
+        ("a@0deg", "VLP-16", "a"), ("a@-5deg", "VLP-16", "a"),
+        ("b@0deg+VLP-32C", "VLP-32C", "b"), ("b@-5deg+VLP-32C", "VLP-32C", "b"),
+        ("b@0deg+AT128", "AT128", "b"), ("b@-5deg+AT128", "AT128", "b"),
+    ]  # fmt: skip
+    result = sites_from(mini, MIXED_SENSORS, sensor='["VLP-32C", "AT128"]')
+    assert [site.name for site in result] == ["a", "b@VLP-32C", "b@AT128"]
+    aimed = sites_from(mini, sensor='["VLP-32C", "small"]', aim="roi")
+    one_by_one = [sites_from(mini, sensor=name, aim="roi") for name in ("VLP-32C", "small")]
+    assert [site.pose for site in aimed if site.pole == "b"] == [each[1].pose for each in one_by_one]
+    path = mini / "scenario.toml"
+    path.write_text(path.read_text().replace('sensor = "small"', 'sensor = ["VLP-32C", "AT128"]'))
+    replaced = sites_from(mini, replace_sensor="small")
+    assert [(site.name, site.sensor) for site in replaced] == [("a", "small"), ("b", "small")]
+
+
+@pytest.mark.parametrize(
+    ("sensor", "message"),
+    [
+        ('["VLP-16", "VLP-16"]', "contains a value twice"),
+        ("[]", "sites.sensor"),
+        ('["VLP-16", "VLP-99"]', r"sites\.sensor: unknown sensor 'VLP-99'"),
+    ],
+)
+def test_rejects_lists_of_sensors(mini: Path, sensor: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        sites_from(mini, sensor=sensor, aim="roi")
+
+
+def test_rows_of_one_pole_with_several_sensors_lead_to_the_list(mini: Path) -> None:
+    rows = "site,x_m,y_m,z_m,sensor\na,0,0,6,VLP-16\na,0,0,6,AT128\n"
+    with pytest.raises(InputError, match=r'use one row, and sites\.sensor = \["VLP-16", "AT128"\]'):
+        sites_from(mini, rows)
+
+
+def test_measured_scan_is_of_one_sensor(mini: Path) -> None:
+    rows = "site,x_m,y_m,z_m,points\na,0,0,6,scan.csv\n"
+    with pytest.raises(InputError, match="one measured scan is given for 2 mounts"):
+        sites_from(mini, rows, sensor='["VLP-16", "AT128"]')
+
+
 def test_replace_sensor_applies_to_rows_that_name_another_sensor(mini: Path) -> None:
     assert [site.sensor for site in sites_from(mini, MIXED_SENSORS)] == ["VLP-16", "small"]
     assert [site.sensor for site in sites_from(mini, MIXED_SENSORS, sensor="AT128")] == ["VLP-16", "AT128"]
@@ -481,6 +524,6 @@ def test_rejects_too_many_combinations(mini: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("EGVS_MAX_SITES", "5")
     rule = "sites.grid={low_m=[0,0],high_m=[1,0],spacing_m=1,heights_m=[3,4,5]}"
     with pytest.raises(
-        InputError, match=r"more than 5 candidates \(each combination of location, height and pitch is one\)"
+        InputError, match=r"more than 5 candidates \(each combination of location, sensor, height and pitch is one\)"
     ):
         sites.candidate_sites(egvs.load(mini, [rule]))

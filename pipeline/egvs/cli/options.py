@@ -61,7 +61,9 @@ Detector = Annotated[
         "streets. Short for --set score.detector=NAME.",
     ),
 ]
-Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Number of threads or processes; one per core by default.")]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", min=1, help="Number of threads or processes; one per core by default.")
+]
 Top = Annotated[
     int | None, typer.Option("--top", metavar="N", min=1, help="Print only the best N sites; all by default.")
 ]

@@ -115,8 +115,7 @@ def _describe_unplaced_sensors(scenario: Scenario, placeable: Collection[str]) -
         return ""
     from egvs.results.labels import join_names
 
-    file = scenario.sites.file or "a file of sites"
-    return f"No plan has {join_names(unplaced)}: for that, each needs rows in {file} with its name in the column sensor."
+    return f"No plan has {join_names(unplaced)}: add {by_number(len(unplaced), 'it', 'them')} to sites.sensor."
 
 
 def _plan_level(scenario: Scenario, folder: Path, placed: SensorPlan) -> DetectionLevel:

@@ -236,7 +236,9 @@ class SitesConfig(StrictModel):
     points: str | None = Field(
         None, description="Measured empty scan of the only site (PCD, PLY, LAS, LAZ, E57, CSV; world frame)"
     )
-    sensor: str = Field("VLP-32C", description="A sensor from `egvs sensors` or from [sensors]")
+    sensor: str | Annotated[tuple[str, ...], Field(min_length=1)] = Field(
+        "VLP-32C", description="A sensor from `egvs sensors` or from [sensors]; each of a list is a candidate"
+    )
     replace_sensor: str | None = Field(
         None, description="A sensor for all sites, also for those whose row names another one"
     )
@@ -292,7 +294,7 @@ class SitesConfig(StrictModel):
         directions = [key for key in SITE_DIRECTIONS if getattr(self, key) is not None]
         if len(directions) > 1:
             raise ValueError(f"expected at most one of aim, aim_m and yaw_deg, got {' and '.join(directions)}")
-        for key in ("heights_m", "pitch_deg"):
+        for key in ("heights_m", "pitch_deg", "sensor"):
             values = getattr(self, key)
             if isinstance(values, tuple) and len(set(values)) < len(values):
                 raise ValueError(f"{key} = {list(values)} contains a value twice")

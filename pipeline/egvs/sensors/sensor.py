@@ -386,7 +386,8 @@ def scenario_sensor(name: str, scenario: Scenario, where: str) -> Sensor:
 def _sites_key(name: str, scenario: Scenario) -> str:
     """Return file and key of ``[sites]`` that set a sensor; empty if only rows of the sites file do."""
     for key in ("replace_sensor", "sensor"):
-        if getattr(scenario.sites, key) == name:
+        value = getattr(scenario.sites, key)
+        if name == value or (isinstance(value, tuple) and name in value):
             file = "--set" if f"sites.{key}" in scenario.overrides else scenario.file
             return f"{file}: sites.{key}"
     return ""

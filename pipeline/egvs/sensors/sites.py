@@ -3,8 +3,8 @@ r"""Candidate sites of a scenario, from a file or a rule, with each height and p
 Candidate sites come from a file (CSV, GeoJSON, GIS formats) or a rule (a lattice, or points along lines). Each has a
 position in the world frame in metres (:mod:`egvs.sensors.site_files` converts longitude and latitude), angles in
 degrees, and a sensor; what a row leaves out is taken from the scenario's ``[sites]``. Each combination of a location
-with a height and a pitch is one candidate. Candidates with the same x, y share one *pole*, named after the first site
-there.
+with a sensor, a height and a pitch is one candidate. Candidates with the same x, y share one *pole*, named after the
+first site there.
 
 A sensor is *aimed* when its middle ray (:attr:`egvs.sensors.sensor.Sensor.middle_deg`) meets a given point. With
 :math:`m` that ray after the roll, and :math:`d` the unit vector from the sensor to the point, pitch and yaw follow from
@@ -175,7 +175,7 @@ class ScannedSite:
 
 
 def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
-    """Return all candidate sites of a scenario, in the order of the file or rule; within a row by height and pitch.
+    """Return all candidate sites of a scenario, in the order of the file or rule; in a row by sensor, height, pitch.
 
     Raises
     ------
@@ -195,7 +195,11 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
             for site in builder.candidates(row):
                 other = names.setdefault(same_name(site.name), site.name)
                 if site.name in sites:
-                    raise InputError(row.where, f"there are two sites {site.name!r}", "Give each site its own name.")
+                    hint = "Give each site its own name."
+                    if site.sensor != sites[site.name].sensor:
+                        both = f'["{sites[site.name].sensor}", "{site.sensor}"]'
+                        hint += f" For several sensors on each pole, use one row, and sites.sensor = {both}."
+                    raise InputError(row.where, f"there are two sites {site.name!r}", hint)
                 if other != site.name:
                     difference = "in the Unicode of accents or in invisible characters"
                     problem = f"the sites {other!a} and {site.name!a} differ only {difference}"
@@ -203,7 +207,7 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
                 sites[site.name] = site
         except InputError as error:
             errors.append(error)
-        site_files.check_site_count(len(sites), path, "each combination of location, height and pitch is one")
+        site_files.check_site_count(len(sites), path, "each combination of location, sensor, height and pitch is one")
     raise_together(errors, "sites")
     if not sites:
         raise InputError(path, "expected at least one site, got none")
@@ -273,6 +277,8 @@ def _check_unused_keys(scenario: Scenario, used_keys: set[str], path: Path) -> N
             hint = "Remove one of them."
         elif key == "sensor":
             hint = f"Use sites.replace_sensor={config.sensor} to replace them, or remove the key."
+            if isinstance(config.sensor, tuple):
+                hint = f"Remove it, or remove {column} from the rows of {path.name}."
         raise InputError(scenario.locate(f"sites.{key}"), problem, hint)
 
 
@@ -338,41 +344,44 @@ class _SiteBuilder:
         self._sensors: dict[str, Sensor] = {}
 
     def candidates(self, row: SiteRow) -> Iterator[Site]:
-        """Yield the candidates of a row, one for each height and pitch."""
+        """Yield the candidates of a row, one for each sensor, height and pitch."""
         columns = row.columns
         user_columns = site_files.user_columns(row.where, columns, site_files.KNOWN_COLUMNS)
         _check_columns(row, self.scenario)
         name = str(columns["site"]).strip()
-        sensor_name = self._sensor_name(columns)
+        sensor_names = self._sensor_names(columns)
         points = str(columns["points"]).strip() if columns.get("points") else None
-        is_inverted = self._is_inverted(row, sensor_name)
-        request = _mount_request(row, self.scenario, is_inverted=is_inverted)
         if columns.get("roll_deg") in (None, ""):
             self.used_keys.add("roll_deg")
-        pole = self._poles.setdefault((request.x_m, request.y_m), name)
-        mounts = self._mounts(row.where, request, sensor_name)
-        if points is not None and len(mounts) > 1:
-            problem = f"one measured scan is given for {len(mounts)} mounts"
-            raise InputError(f"{row.where}: points", problem, "Use one height and one pitch.")
-        for mount in mounts:
-            site_name = name + mount.name_suffix
-            if not _SITE_NAME.fullmatch(site_name):
-                problem = f"expected a name of up to 80 characters without / and \\, got {site_name[:80]!r}"
-                raise InputError(f"{row.where}: site", problem)
-            pose = Pose(request.x_m, request.y_m, mount.z_m, mount.yaw_deg, mount.pitch_deg, request.roll_deg)
-            yield Site(site_name, pose, sensor_name, points, pole, user_columns)
+        for sensor_name in sensor_names:
+            request = _mount_request(row, self.scenario, is_inverted=self._is_inverted(row, sensor_name))
+            pole = self._poles.setdefault((request.x_m, request.y_m), name)
+            mounts = self._mounts(row.where, request, sensor_name)
+            if points is not None and (n_mounts := len(mounts) * len(sensor_names)) > 1:
+                problem = f"one measured scan is given for {n_mounts} mounts"
+                raise InputError(f"{row.where}: points", problem, "Use one height, one pitch and one sensor.")
+            for mount in mounts:
+                site_name = name + mount.name_suffix
+                if len(sensor_names) > 1:
+                    site_name += f"{'+' if mount.name_suffix else '@'}{sensor_name}"
+                if not _SITE_NAME.fullmatch(site_name):
+                    problem = f"expected a name of up to 80 characters without / and \\, got {site_name[:80]!r}"
+                    raise InputError(f"{row.where}: site", problem)
+                pose = Pose(request.x_m, request.y_m, mount.z_m, mount.yaw_deg, mount.pitch_deg, request.roll_deg)
+                yield Site(site_name, pose, sensor_name, points, pole, user_columns)
 
-    def _sensor_name(self, columns: Mapping[str, Any]) -> str:
+    def _sensor_names(self, columns: Mapping[str, Any]) -> tuple[str, ...]:
         config = self.scenario.sites
         if config.replace_sensor is not None:
-            return config.replace_sensor
+            return (config.replace_sensor,)
+        default = config.sensor if isinstance(config.sensor, tuple) else (config.sensor,)
         if columns.get("sensor"):
             name = str(columns["sensor"]).strip()
-            if name == config.sensor:  # the row says the same
+            if (name,) == default:  # the row says the same
                 self.used_keys.add("sensor")
-            return name
+            return (name,)
         self.used_keys.add("sensor")
-        return config.sensor
+        return default
 
     def _is_inverted(self, row: SiteRow, sensor_name: str) -> bool:
         """Whether the sensor is upside down: by the row, else by ``[sites]``, else by the sensor."""

@@ -285,7 +285,7 @@ class Project:
         scene = self._scene()
         with self._scene_lock:
             return scene.poles.problem(
-                str(body.get("site", "")), x_m, y_m, heights_m, row.get("sensor") or config.sensor
+                str(body.get("site", "")), x_m, y_m, heights_m, row.get("sensor") or self._sensor
             )
 
     def _refuse_impossible(self, body: dict[str, Any], field_name: str = "x_m") -> None:
@@ -325,7 +325,7 @@ class Project:
             self._fill(table, row, {key: value for key, value in body.items() if key not in ("site", *_FLAGS)})
             row["site"] = new_name
             self._set_flags(document, name, new_name, body, row)
-            if (default := self._default_sensor(table)) != self._scenario.sites.sensor:
+            if (default := self._default_sensor(table)) != self._sensor:
                 document["sites"]["sensor"] = default
             after = {**self._contents, self.sites_file: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)}
             label = f"{'move' if is_moved and len(body) <= 2 else 'edit'} {name}"
@@ -351,8 +351,14 @@ class Project:
 
     def _default_sensor(self, table: CsvTable) -> str:
         """Return the sensor of ``[sites]``; that of the first pole where no pole has it any more."""
-        sensors = [row.get("sensor") or self._scenario.sites.sensor for row in table.rows]
-        return self._scenario.sites.sensor if self._scenario.sites.sensor in sensors else sensors[0]
+        sensors = [row.get("sensor") or self._sensor for row in table.rows]
+        return self._sensor if self._sensor in sensors else sensors[0]
+
+    @property
+    def _sensor(self) -> str:
+        """The sensor of ``[sites]``; the first one of several."""
+        sensor = self._scenario.sites.sensor
+        return sensor if isinstance(sensor, str) else sensor[0]
 
     @property
     def sites_file(self) -> str:
@@ -387,6 +393,8 @@ class Project:
             return f"The sites are in {name}, which is no CSV file in the scenario's folder."
         if not set(_POSITION_COLUMNS) <= set(CsvTable.parse(self._contents[name]).columns):
             return f"{name} has no columns site, x_m and y_m: edit it as a file."
+        if isinstance(self._scenario.sites.sensor, tuple):
+            return f"{SCENARIO_FILE} has several sensors for each pole: edit {name} as a file."
         return ""
 
     def _sites_table(self, *, editable: bool = True) -> tuple[CsvTable, dict[str, dict[str, str]]]:
@@ -631,7 +639,7 @@ class Project:
                 "roi": {"center_m": scenario.roi.center_m, "size_m": scenario.roi.size_m},
                 "map_key": scene.key, "aerial": aerial.describe_picture(self.folder),
                 "mounts": {
-                    "sensor": config.sensor, "heights_m": list(config.heights_m or ()),
+                    "sensor": self._sensor, "heights_m": list(config.heights_m or ()),
                     "pitch_deg": list(config.pitch_deg) if isinstance(config.pitch_deg, tuple) else [config.pitch_deg],
                 },
                 "sensors": self._sensor_names(),
