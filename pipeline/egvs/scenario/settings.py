@@ -74,7 +74,8 @@ def _format_toml(value: Any) -> str:
 def changed_settings(base: Mapping[str, Any], values: Mapping[str, Any]) -> Settings:
     """Return the settings of ``values`` that differ from those of ``base``, by full key, sorted.
 
-    A setting that only ``base`` has is None. 5 and 5.0 are equal, and so are None and a missing key.
+    A setting that only ``base`` has is None. 5 and 5.0 are equal, and so are None and a missing key. Settings without
+    effect beside others (:func:`without_replaced`) are left out.
 
     Parameters
     ----------
@@ -87,12 +88,21 @@ def changed_settings(base: Mapping[str, Any], values: Mapping[str, Any]) -> Sett
     {'score.gamma': 5.0}
     """
     before, after = flatten_settings(base), flatten_settings(values)
+    effective = without_replaced(after)
     changed: Settings = {}
     for key in sorted(before.keys() | after.keys()):
         if before.get(key) == after.get(key) or _is_table(key, before) or _is_table(key, after):
             continue
-        changed[key] = after.get(key)
+        if key in effective or key not in after:
+            changed[key] = after.get(key)
     return changed
+
+
+def without_replaced(settings: Settings) -> Settings:
+    """Return settings without the sensor of ``[sites]`` where ``replace_sensor`` leaves no site to it."""
+    if settings.get("sites.replace_sensor") is None:
+        return settings
+    return {key: value for key, value in settings.items() if key != "sites.sensor"}
 
 
 def _is_table(key: str, settings: Settings) -> bool:

@@ -36,7 +36,7 @@ from egvs.results.sensors import ScoreDifference, SensorComparison, SensorMount,
 from egvs.runs.run_sources import PLAN_REQUEST
 from egvs.scenario.costs import costs_from_dict
 from egvs.scenario.score_config import CostsConfig
-from egvs.scenario.settings import flatten_settings
+from egvs.scenario.settings import flatten_settings, without_replaced
 from egvs.sensors.sensor import check_sensor_names
 from egvs.statistics.ranks import best_sites, rank_agreement, regret
 from egvs.studies.paired_errors import ScoreDifferences, SiteOfRun, interval_changes
@@ -338,7 +338,7 @@ def _read_run(folder: Path, label: str, cost_overrides: Sequence[str]) -> Compar
     compared = {key: value for key, value in record.scenario.items() if key not in _IGNORED_SETTINGS}
     placement = compared.get("placement", {})
     compared["placement"] = {key: value for key, value in placement.items() if f"placement.{key}" not in PLAN_REQUEST}
-    settings = {**flatten_settings(compared), "egvs (version)": record.egvs}
+    settings = {**without_replaced(flatten_settings(compared)), "egvs (version)": record.egvs}
     if settings.get("score.gamma") == "auto":
         settings["score.gamma"] = metadata["gamma"]
     if "traffic" in record.stages and record.stages["traffic"].summary.get("sumo") is not None:
