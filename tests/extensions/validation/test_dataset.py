@@ -195,6 +195,16 @@ def test_readme_matches_files(four_sites, tmp_path):
     assert "at least 2 s apart" in text and "small 0." in text
 
 
+def test_points_turned_back_lie_on_the_rings_of_the_sensor(four_sites, tmp_path):
+    done = write_dataset(load(four_sites), tmp_path / "out", frames=2, kind="openpcdet")
+    for summary in done.sites:
+        folder = tmp_path / "out" / summary.site
+        points = np.concatenate([np.load(path)[:, :3] for path in (folder / "points").iterdir()]).astype(float)
+        turned = points @ np.array(json.loads((folder / "about.json").read_text())["T_level_sensor"])[:3, :3]
+        elevation_deg = np.degrees(np.arcsin(turned[:, 2] / np.linalg.norm(turned, axis=1)))
+        assert set(np.round(elevation_deg, 2)) <= set(np.linspace(-15, 5, 8).round(2)), summary.site
+
+
 def test_openpcdet_grid_contains_labels(four_sites, tmp_path):
     done = write_dataset(load(four_sites), tmp_path / "out", frames=FRAMES, kind="openpcdet")
     for summary in done.sites:

@@ -102,7 +102,11 @@ def accept(
         ),
     ] = MAX_VEHICLE_HEIGHT_M,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; RUN/acceptance by default.")
+        Path | None,
+        typer.Option(
+            "--out", metavar="DIR",
+            help="Folder to write; RUN/acceptance by default. The verdict is always added to the report of the run.",
+        ),
     ] = None,
 ) -> None:  # fmt: skip
     """Compare a measured scan of an installed sensor with the planned one: pass (exit code 0) or fail (1)."""

@@ -263,8 +263,8 @@ def clouds(
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="kitti, openpcdet, ply or pcd. Points are in a levelled frame at the sensor; turn them back by pitch"
-            " and roll for egvs accept.",
+            help="kitti, openpcdet, ply or pcd. Points are in a levelled frame at the sensor; the README in the folder"
+            " says how to turn them back for egvs accept.",
         ),
     ] = "kitti",
     set_: Set = None,

@@ -251,7 +251,8 @@ Units are metres and radians. The origin is the sensor. x is level and points al
 also for a tilted sensor: points are rotated by its roll and pitch, because a box here has no angle except its heading.
 So the ground is at about minus the height of the sensor. Headings are counter-clockwise from x, seen from above: 0
 drives along x, pi/2 along y. `T_world_level` in each `about.json` is the transform to the world frame (x east, y north,
-z up).
+z up), `T_level_sensor` that from the sensor's own frame: for `egvs accept`, points (n, 3) are turned back by
+`points @ T_level_sensor[:3, :3]`.
 
 Boxes are upright. A vehicle on a slope is pitched (`pitch_rad` in `objects.csv`, nose up), so points on it may be
 slightly outside of its box. The same is true for all points, because of range noise.
@@ -280,7 +281,7 @@ def _files_section(layout: Layout, sites: Sequence[SiteSummary]) -> str:
         "- `objects.csv`: every box of every frame, visible or not, in the frame above: its number in the frame, SUMO's"
         " id and vClass, part (0, or 1.. for the rear of an articulated vehicle), class, number of points on it,"
         " `in_roi` (1: ground truth of `egvs validate`).",
-        "- `about.json`: pose, sensor, noise, counts, `T_world_level`.",
+        "- `about.json`: pose, sensor, noise, counts, transforms.",
     ]
     return "\n".join(rows) + "\n"
 

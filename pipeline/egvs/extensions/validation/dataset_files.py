@@ -188,13 +188,20 @@ class LevelFrame:
         matrix[:3, 3] = self.pose.position_m
         return matrix
 
+    @property
+    def T_level_sensor(self) -> FloatArray:
+        """Transform of points from the sensor's frame to this frame, (4, 4) float64."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation_world_sensor(0.0, self.pose.pitch_deg, self.pose.roll_deg)
+        return matrix
+
     def points(self, points: Points) -> Points:
         """Convert points of the sensor's frame, x, y, z, intensity (n, 4), to this frame."""
         _, pitch_deg, roll_deg = self.pose.angles_deg
         if pitch_deg == 0.0 and roll_deg == 0.0:
             return points
         level = points.copy()
-        level[:, :3] = _rotate(rotation_world_sensor(0.0, pitch_deg, roll_deg), points[:, :3].astype(np.float64))
+        level[:, :3] = _rotate(self.T_level_sensor[:3, :3], points[:, :3].astype(np.float64))
         return level
 
     def boxes(self, boxes: FloatArray) -> FloatArray:
@@ -240,7 +247,7 @@ class SiteSummary:
     ----------
     site, sensor, pose, range_sigma_m
         The site, its sensor, and the noise of its ranges.
-    T_world_level
+    T_world_level, T_level_sensor
         See :class:`LevelFrame`.
     train, val, empty
         Frames of the split; frames without a labelled box are in neither.
@@ -265,6 +272,7 @@ class SiteSummary:
     pose: dict[str, float]
     range_sigma_m: float
     T_world_level: list[list[float]]
+    T_level_sensor: list[list[float]]
     train: list[str] = field(default_factory=list)
     val: list[str] = field(default_factory=list)
     empty: list[str] = field(default_factory=list)
@@ -387,8 +395,11 @@ def write_site(
     for name in layout.folders:
         (folder / name).mkdir(parents=True)
     view = simulator.view
-    transform = LevelFrame(view.pose).T_world_level.tolist()
-    summary = SiteSummary(view.site, view.sensor.name, asdict(view.pose), view.sensor.range_sigma_m, transform)
+    frame = LevelFrame(view.pose)
+    summary = SiteSummary(
+        view.site, view.sensor.name, asdict(view.pose), view.sensor.range_sigma_m,
+        frame.T_world_level.tolist(), frame.T_level_sensor.tolist(),
+    )  # fmt: skip
     training = set(record.numbers[: max(1, int(TRAINING_SHARE * record.frames + 1e-9))].tolist())
     write_frame = partial(_write_frame, folder, record, simulator, layout)
 

@@ -458,7 +458,7 @@ def test_says_that_a_scan_was_levelled(tmp_path: Path) -> None:
     hung = write_street(tmp_path / "hung", kiosk, sites="pole_a,10,0,5,0,-5\n", mount="inverted")
     level = hung.points() @ rotation_world_sensor(0.0, -5.0, 180.0).T
     with pytest.raises(
-        InputError, match=r"it was levelled\. .* egvs clouds, .* back by pitch -5 and roll 180 degrees\."
+        InputError, match=r"it was levelled\. .* egvs clouds are levelled: turn them back by T_level_sensor"
     ):
         accept_points(hung, level)
 

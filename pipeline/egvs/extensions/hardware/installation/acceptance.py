@@ -450,8 +450,7 @@ def _check_frame(
 ) -> None:
     """Raise an InputError that names the frame in which scans fit the static world, if one fits well."""
     own_frame = "Export it in the sensor's own frame: x forward, y left, z along its axis, right-handed."
-    turn_back = f"Turn points of egvs clouds, which are levelled, back by pitch {start.pitch_deg:g} and roll"
-    level_hint = f"{own_frame} {turn_back} {start.roll_deg:g} degrees."
+    level_hint = f"{own_frame} Points of egvs clouds are levelled: turn them back by T_level_sensor in about.json."
     other_mount = "upright" if start.is_inverted else "inverted"
     level = rotation_world_sensor(0.0, start.pitch_deg, start.roll_deg)
     frames: list[tuple[FloatArray, str, str]] = [
