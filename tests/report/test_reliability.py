@@ -28,17 +28,17 @@ def test_nothing_is_said_of_a_level_site_between_the_limits() -> None:
 @pytest.mark.parametrize(
     ("mounts", "limits"),
     [
-        ([(3, 0), (4, 0)], "the lowest height tried (z 3 m)"),
-        ([(4, 0), (3, 0)], "the greatest height tried (z 4 m)"),
-        ([(3, -10), (3, 0)], "the steepest tilt tried (-10 degrees)"),
-        ([(3, 0), (3, -10)], "the least tilt tried (0 degrees)"),
-        ([(4, -10), (3, -20), (4, -15)], "the greatest height tried (z 4 m) and the least tilt tried (-10 degrees)"),
-        ([(3, -10), (4, 0)], "the lowest height tried (z 3 m) and the steepest tilt tried (-10 degrees)"),
+        ([(3, 0), (4, 0)], "lowest (z 3 m)"),
+        ([(4, 0), (3, 0)], "highest (z 4 m)"),
+        ([(3, -10), (3, 0)], "steepest (-10°)"),
+        ([(3, 0), (3, -10)], "least tilted (0°)"),
+        ([(4, -10), (3, -20), (4, -15)], "highest (z 4 m) and least tilted (-10°)"),
+        ([(3, -10), (4, 0)], "lowest (z 3 m) and steepest (-10°)"),
     ],
 )
 def test_names_the_limits_that_the_best_mount_of_a_pole_reaches(mounts: list[tuple[float, float]], limits: str) -> None:
     sites = [("a", z_m, pitch_deg, 9.0 - rank) for rank, (z_m, pitch_deg) in enumerate(mounts)]
-    sentence = f"The best site has {limits}: one beyond what was tried may be better."
+    sentence = f"The best mount is the {limits} of those tried: one beyond may be better."
     assert describe_reliability(ranked(*sites))[-1] == sentence
 
 

@@ -113,6 +113,8 @@ def _print_short(
         after += wrap_lines(missing, 1)
     if on_road := sections.describe_poles_on_road(ranked.poles[:MIN_POLES], _warnings(record)):
         after += wrap_lines(f"Careful: {join_names(on_road)}.", 1)
+    if limits := reliability.describe_limits(ranked):
+        after += wrap_lines(limits, 1)
     plans = record.traffic_summary.get("signals", ())
     if assumed := sections.main_assumptions(sections.assumptions(scenario, plans)):
         after += wrap_lines(assumed, 1)

@@ -91,9 +91,8 @@ def describe_reliability(
     is_pitched = not low_deg - _PITCH_TOLERANCE_DEG <= best.pitch_deg <= high_deg + _PITCH_TOLERANCE_DEG
     if is_pitched or abs(best.pose.side_tilt_deg) > roll_deg:  # upside down is no tilt
         sentences.append(_TILT_NOTE.format(best.site, low_deg, high_deg, roll_deg))
-    limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
-    if limits:
-        sentences.append(f"The best site has {join_names(limits)}: one beyond what was tried may be better.")
+    if limits := describe_limits(ranking):
+        sentences.append(limits)
     return sentences
 
 
@@ -134,17 +133,22 @@ def _track_summaries(traffic: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [summary["coverage"] for summary in tracks if "coverage" in summary]
 
 
+def describe_limits(ranking: Ranking) -> str:
+    """Return a sentence if the best site is at the end of the heights or tilts on its pole; else empty."""
+    best = ranking.sites[0]
+    limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
+    return f"The best mount is the {join_names(limits)} of those tried: one beyond may be better." if limits else ""
+
+
 def _limits(best: RankedSite, on_pole: Sequence[RankedSite]) -> Iterator[str]:
-    """Yield the limits of the mounts on a pole that its best one has reached, e.g. "the lowest height tried (3 m)"."""
+    """Yield the limits of the mounts on a pole that its best one has reached, e.g. "lowest (z 3 m)"."""
     heights_m = {site.z_m for site in on_pole}
     if len(heights_m) > 1 and best.z_m in (min(heights_m), max(heights_m)):
-        end = "lowest" if best.z_m == min(heights_m) else "greatest"
-        yield f"the {end} height tried (z {best.z_m:.4g} m)"
+        yield f"{'lowest' if best.z_m == min(heights_m) else 'highest'} (z {best.z_m:.4g} m)"
     pitches_deg = {site.pitch_deg for site in on_pole}
     steepest_deg, flattest_deg = min(pitches_deg), max(pitches_deg)
     if steepest_deg < flattest_deg and steepest_deg <= -MIN_TILT_DEG and best.pitch_deg in (steepest_deg, flattest_deg):
-        end = "steepest" if best.pitch_deg == steepest_deg else "least"
-        yield f"the {end} tilt tried ({best.pitch_deg:z.0f} degrees)"
+        yield f"{'steepest' if best.pitch_deg == steepest_deg else 'least tilted'} ({best.pitch_deg:z.0f}°)"
 
 
 # ---- warnings
