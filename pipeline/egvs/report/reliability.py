@@ -141,14 +141,14 @@ def describe_limits(ranking: Ranking) -> str:
 
 
 def _limits(best: RankedSite, on_pole: Sequence[RankedSite]) -> Iterator[str]:
-    """Yield the limits of the mounts on a pole that its best one has reached, e.g. "lowest (z 3 m)"."""
+    """Yield the limits of the mounts on a pole that its best one has reached, e.g. "lowest"."""
     heights_m = {site.z_m for site in on_pole}
     if len(heights_m) > 1 and best.z_m in (min(heights_m), max(heights_m)):
-        yield f"{'lowest' if best.z_m == min(heights_m) else 'highest'} (z {best.z_m:.4g} m)"
+        yield "lowest" if best.z_m == min(heights_m) else "highest"
     pitches_deg = {site.pitch_deg for site in on_pole}
     steepest_deg, flattest_deg = min(pitches_deg), max(pitches_deg)
     if steepest_deg < flattest_deg and steepest_deg <= -MIN_TILT_DEG and best.pitch_deg in (steepest_deg, flattest_deg):
-        yield f"{'steepest' if best.pitch_deg == steepest_deg else 'least tilted'} ({best.pitch_deg:z.0f}°)"
+        yield "steepest" if best.pitch_deg == steepest_deg else "least tilted"
 
 
 # ---- warnings
