@@ -26,7 +26,7 @@ export function kindOf(site) {
 export function mapView() {
   view ??= new MapView(byId("stage"), {
     onSelect: (id) => select(id),
-    onMove: (id, at_m) => moveItem(id, at_m),
+    onMove: moveItem,
     onAdd: (at_m) => addPole(at_m),
     onDelete: (id) => data.step === "poles" && data.project?.sites.some((/** @type {any} */ site) => site.site === id) && removePole(id),
     onDrag: (id, at_m) => dragged({ id, at_m }),
@@ -164,18 +164,21 @@ async function addPole([x_m, y_m]) {
   announce(`Added ${state.site}.`);
 }
 
-/** @param {string} id @param {Point} at_m */
-async function moveItem(id, at_m) {
+/** @param {string} id @param {Point} at_m @param {boolean} isFine */
+async function moveItem(id, at_m, isFine) {
   request += 1;
   if (id.startsWith("obstacle ")) {
     const obstacles = data.project.obstacles.map((/** @type {any} */ other) => (`obstacle ${other.name}` === id ? { ...other, x_m: at_m[0], y_m: at_m[1] } : other));
     await saveObstacles(obstacles);
     return;
   }
-  const state = await change("PATCH", `sites/${encodeURIComponent(id)}`, { x_m: at_m[0], y_m: at_m[1] }, (error) => {
+  const [x_m, y_m] = at_m.map((value) => Math.round(value * 100) / 100);
+  if (isFine) update({ dropped: { site: id, x_m, y_m } });
+  const state = await change("PATCH", `sites/${encodeURIComponent(id)}`, { x_m, y_m }, (error) => {
     update({ project: data.project }); // puts it back
     refuse(at_m, error.reason);
   });
+  update({ dropped: null });
   if (state) announce(`Moved ${id}.`);
 }
 

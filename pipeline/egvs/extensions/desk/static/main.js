@@ -146,7 +146,7 @@ addEventListener("hashchange", readStep);
 readStep();
 let wasLost = false;
 listen({
-  state: ({ revision }) => settled().then(() => revision !== data.revision && fetchState()), // answers to own changes have it
+  state: ({ revision }) => settled().then(() => revision === data.revision ? null : fetchState()), // answers to own changes have it
   job: takeJob,
   log: ({ line }) => update({ log: [...data.log, line].slice(-200) }),
   score: showScore,

@@ -22,7 +22,7 @@ import { h, s, show, debounced } from "./dom.js";
  *
  * @typedef {Object} Handlers
  * @property {(id: string|null) => void} onSelect
- * @property {(id: string, at_m: Point) => void} onMove at the end of a drag, or when the arrow keys rest
+ * @property {(id: string, at_m: Point, isFine: boolean) => void} onMove at the end of a drag, or when the arrow keys rest; isFine if the last hint was no refusal
  * @property {(at_m: Point) => void} onAdd
  * @property {(id: string) => void} onDelete
  * @property {(id: string, at_m: Point) => void} onDrag while it is dragged
@@ -409,13 +409,13 @@ export class MapView {
   }
 
   endMove() {
-    const { moving } = this;
+    const { moving, isFine } = this;
     this.moving = null;
     if (!moving) return;
     this.clearRefusal();
     const item = this.items.find((other) => other.id === moving.id);
     if (item) item.at_m = moving.at_m; // until the server answers
-    this.handlers.onMove(moving.id, moving.at_m);
+    this.handlers.onMove(moving.id, moving.at_m, isFine);
   }
 
   // ---------------------------------------------------------------- keyboard

@@ -18,6 +18,7 @@ import { ask, byId, h, show } from "./dom.js";
  * @property {any} trial what another sensor on one pole of the plan would change
  * @property {any} whatIf
  * @property {string|null} three address of the 3D view that is shown
+ * @property {{site: string, x_m: number, y_m: number}|null} dropped pole whose new position is on its way to the server
  * @property {string} step
  * @property {string|null} selected name of the chosen site or junction
  * @property {boolean} isAdding
@@ -27,7 +28,7 @@ import { ask, byId, h, show } from "./dom.js";
 /** @type {Data} */
 export const data = {
   revision: -1, project: null, job: null, start: null, map: null, upload: null, ranking: null, plan: null,
-  downloads: null, suggestions: null, keptPlan: null, trial: null, whatIf: null, three: null, step: "poles", selected: null, isAdding: false,
+  downloads: null, suggestions: null, keptPlan: null, trial: null, whatIf: null, three: null, dropped: null, step: "poles", selected: null, isAdding: false,
   log: [],
 };
 

@@ -26,7 +26,8 @@ function isSoftware() {
 function sensor() {
   const pole = data.project.sites.find((/** @type {any} */ site) => site.site === data.selected);
   const site = pole && candidateOf(pole.site);
-  return site ? { site, x_m: pole.x_m, y_m: pole.y_m, z_m: pole.z_m, pitch_deg: pole.pitch_deg } : {};
+  const { x_m, y_m } = data.dropped?.site === data.selected ? data.dropped : pole ?? {};
+  return site ? { site, x_m, y_m, z_m: pole.z_m, pitch_deg: pole.pitch_deg } : {};
 }
 
 /** Start it, or let it show the chosen pole. */
