@@ -136,7 +136,8 @@ def _track_summaries(traffic: Mapping[str, Any]) -> list[dict[str, Any]]:
 def describe_limits(ranking: Ranking) -> str:
     """Return a sentence if the best site is at the end of the heights or tilts on its pole; else empty."""
     best = ranking.sites[0]
-    limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
+    others = [site for site in ranking.sites if (site.pole, site.sensor) == (best.pole, best.sensor)]
+    limits = list(_limits(best, others))
     return f"The best mount is the {join_names(limits)} of those tried: one beyond may be better." if limits else ""
 
 

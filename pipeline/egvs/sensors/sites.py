@@ -275,10 +275,8 @@ def _check_unused_keys(scenario: Scenario, used_keys: set[str], path: Path) -> N
         if key == "sensor" and config.replace_sensor is not None:
             problem = "the key has no effect on any site: replace_sensor sets the sensor of all"
             hint = "Remove one of them."
-        elif key == "sensor":
+        elif key == "sensor" and isinstance(config.sensor, str):
             hint = f"Use sites.replace_sensor={config.sensor} to replace them, or remove the key."
-            if isinstance(config.sensor, tuple):
-                hint = f"Remove it, or remove {column} from the rows of {path.name}."
         raise InputError(scenario.locate(f"sites.{key}"), problem, hint)
 
 
