@@ -16,6 +16,7 @@ from egvs.core.errors import (
     DiagnosticsError,
     InputError,
     collect_warnings,
+    truncate_text,
     unknown_site,
     with_relative_paths,
 )
@@ -90,3 +91,9 @@ def test_decimal_comma_has_its_hint(problem: str, is_comma: bool) -> None:
 
 def test_decimal_comma_hides_no_further_errors() -> None:
     assert InputError("a.csv", "expected a number, got '4,5'", "\nb.csv: is empty").hint == "\nb.csv: is empty"
+
+
+def test_long_text_says_how_much_it_lacks_however_often_it_is_shortened() -> None:
+    short = truncate_text("\n".join(f"row {row}" for row in range(5_000)))
+    assert short.splitlines()[-2:] == ["row 29", "... and 4,970 more"]
+    assert truncate_text(short) == short

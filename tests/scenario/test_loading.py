@@ -202,3 +202,11 @@ def test_names_the_table_of_a_key_that_stands_elsewhere(key: str, hint: str) -> 
     with pytest.raises(InputError) as error:
         loading.load("demo", [key])
     assert hint in str(error.value)
+
+
+@pytest.mark.parametrize("key", ["frame_period_s", "step_s"])
+def test_times_below_a_millisecond_are_refused_before_frames_are_counted(key: str, tmp_path: Path) -> None:
+    """``length_s`` of a period, divided by such a time, is infinite."""
+    above = f'[traffic]\n{key} = 1e-320\n[[traffic.periods]]\nname = "day"\nlength_s = 60\n'
+    with pytest.raises(InputError, match=rf"traffic\.{key}: expected a value greater than or equal to 0\.001"):
+        extended(tmp_path, above)

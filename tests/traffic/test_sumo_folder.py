@@ -44,11 +44,11 @@ BAD = {
         InputError,
         r"warmup_s = 10\.1: expected a multiple",
     ),
-    "step below a millisecond": (
+    "step between milliseconds": (
         nothing,
-        {"network": "net.xml", "step_s": 0.0004},
+        {"network": "net.xml", "step_s": 0.0015},
         InputError,
-        r"step_s = 0\.0004: expected a whole number of milliseconds",
+        r"step_s = 0\.0015: expected a whole number of milliseconds",
     ),
     "no network": (
         nothing,

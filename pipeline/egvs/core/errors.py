@@ -22,8 +22,10 @@ from typing import Any, TypeVar
 
 from egvs.core.wording import list_first
 
-MAX_LINE_LENGTH, MAX_LINES = 600, 200
+MAX_LINE_LENGTH, MAX_LINES = 600, 30
 """Limits of a message in characters and lines."""
+
+_MORE = re.compile(r"\.\.\. and [0-9,]+ more")
 
 Item = TypeVar("Item")
 Parsed = TypeVar("Parsed")
@@ -101,10 +103,11 @@ def format_problem(where: str, problem: str, hint: str = "") -> str:
 
 
 def truncate_text(text: str) -> str:
-    """Shorten a text to the length of a message, and escape control characters."""
+    """Shorten a text to the length of a message, and escape control characters; a shortened one stays as it is."""
     lines = text.split("\n")
-    short = [_truncate_line(line) for line in lines[:MAX_LINES]]
-    if len(lines) > MAX_LINES:
+    is_short = len(lines) == MAX_LINES + 1 and _MORE.fullmatch(lines[-1]) is not None
+    short = [_truncate_line(line) for line in lines[: MAX_LINES + is_short]]
+    if len(lines) > MAX_LINES and not is_short:
         short.append(f"... and {len(lines) - MAX_LINES:,} more")
     return "\n".join(short)
 

@@ -59,6 +59,9 @@ MAX_PER_HOUR = 1e5
 
 EdgeId = Annotated[str, Field(min_length=1)]
 
+Step = Annotated[float, Field(ge=1e-3)]
+"""Seconds; SUMO counts in milliseconds."""
+
 
 class CountConfig(StrictModel):
     """A traffic count: vehicles per hour on an edge, or from one edge to another."""
@@ -334,14 +337,14 @@ class TrafficConfig(StrictModel):
         " its own; the first has the scenario's seed. From 2 on, standard errors come from the differences between"
         " them. It must divide tpog.blocks",
     )
-    frame_period_s: Positive = Field(1.0, description="Time between two frames; a multiple of step_s")
+    frame_period_s: Step = Field(1.0, description="Time between two frames; a multiple of step_s")
     begin_s: float | None = Field(
         None,
         ge=0,
         description="Simulation time at the beginning, warmup_s before the first frame. By default that of the sumocfg,"
         " or 0. For a finished file: seconds of it that are skipped before the warm-up",
     )
-    step_s: Positive = Field(0.25, description="SUMO's step length")
+    step_s: Step = Field(0.25, description="SUMO's step length")
     warmup_s: float = Field(
         default_factory=lambda values: 0.0 if _is_finished(values) else DEFAULT_WARMUP_S,
         ge=0,
