@@ -323,6 +323,17 @@ def test_tables_of_poles_fit_the_terminal(width: int, runs: int, monkeypatch: py
         assert "kerb_0@4.5m-10deg" in first_rows[0]
 
 
+def test_mounts_upside_down_are_told_from_upright_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    upright = mounts("s", 0.9)
+    hung = [replace(site, roll_deg=180.0, sensor="t") for site in mounts("s", 0.8)]
+    row = next(
+        line
+        for line in printed_text(by_pole(made_run("A", *upright), made_run("B", *hung)), 90, monkeypatch).splitlines()
+        if line.startswith("kerb_0")
+    )
+    assert row.count("4.5 m, -10°") == 2 and row.count("upside down") == 1
+
+
 def test_says_at_how_many_poles_a_run_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
     """By +3, +0.2 and -2 percentage points, each with a standard error of 0.4."""
     a, b = made_run("A", *mounts("s", 0.9, 0.8, 0.7)), made_run("B", *mounts("t", 0.93, 0.802, 0.68))

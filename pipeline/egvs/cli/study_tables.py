@@ -36,7 +36,7 @@ from egvs.report.sensor_text import (
     range_note,
 )
 from egvs.results.labels import SCORE_LABELS, join_names
-from egvs.results.ranking import RankedSite, share_of_limit
+from egvs.results.ranking import RankedSite, describe_roll, share_of_limit
 from egvs.results.sensors import (
     ScoreDifference,
     SensorComparison,
@@ -167,8 +167,9 @@ def _pole_columns(comparison: Comparison, runs: Sequence[int], width: int) -> li
 
 
 def _is_same_mount(pole: ComparedPole) -> bool:
-    """Whether the best mounts of a pole have the same height and tilt in all runs."""
-    return len({None if mount is None else (mount.z_m, mount.pitch_deg) for mount in pole.mounts}) == 1
+    """Whether the best mounts of a pole have the same height, tilt and roll in all runs."""
+    poses = {None if mount is None else (mount.z_m, mount.pitch_deg, mount.roll_deg) for mount in pole.mounts}
+    return len(poses) == 1
 
 
 def _mount_columns(
@@ -206,8 +207,9 @@ def _mount_columns(
 
 
 def _describe_mount(with_pitch: bool, site: RankedSite) -> str:
-    """Return height and pitch, e.g. "3 m, -10°"."""
-    return f"{site.z_m:.4g} m, {site.pitch_deg:z.0f}°" if with_pitch else f"{site.z_m:.4g} m"
+    """Return height, pitch and roll, e.g. "3 m, -10°, upside down"."""
+    parts = [f"{site.z_m:.4g} m", f"{site.pitch_deg:z.0f}°" if with_pitch else "", describe_roll(site.roll_deg)]
+    return ", ".join(part for part in parts if part)
 
 
 def format_score(site: RankedSite) -> str:
