@@ -61,6 +61,7 @@ _KEY_COMMENTS = {  # of tables and keys; the table of a key above all tables is 
     ("score", "rank_by"): "the expected share of vehicles that detectors find; docs/validity.md",
     ("score", "zones"): "results are also reported for these areas; edit, add or remove them as you like",
     ("sites", "existing_poles"): "names of poles that stand already, or 'all': they cost nothing, and are not assumed",
+    ("sites", "sensor"): "or a list, such as ['VLP-32C', 'OS1-64']: each is a candidate",
     ("sites", "aim"): "sensors face the centre of the region",
     (
         "sites",
