@@ -104,10 +104,12 @@ def open_run(scenario: Scenario, run: Path) -> StageContext:
     return open_folder(scenario, run, recorded=stage_registry.recorded_digests(RunRecord.read(run)))
 
 
-def with_other_sensor(folder: Path, score: str, points: str = "") -> Scenario:
-    """Return ``mini`` with another sensor on one pole."""
-    write_mini(folder)
-    rows = f"pole_a,10,12,3,,\npole_b,30.5,-12,3,VLP-16,{points}\n"
+def with_other_sensor(folder: Path, score: str, points: str = "", sensor: str = "VLP-16") -> Scenario:
+    """Return ``mini`` with another sensor on one pole; its own sensor is known as ``small_too``, too."""
+    toml = write_mini(folder) / "scenario.toml"
+    own = toml.read_text().partition("[sensors.small]")[2].partition("[score]")[0]
+    toml.write_text(f"{toml.read_text()}\n[sensors.small_too]{own}")
+    rows = f"pole_a,10,12,3,,\npole_b,30.5,-12,3,{sensor},{points}\n"
     (folder / "sites.csv").write_text(f"site,x_m,y_m,z_m,sensor,points\n{rows}")
     return egvs.load(folder, [f"score.rank_by={score}"])
 
@@ -125,16 +127,27 @@ def test_joint_score_is_that_of_a_run_with_the_other_sensor(
     planned: tuple[StageContext, SensorPlan], tmp_path: Path
 ) -> None:
     context, plan = planned
-    assert plan_sensors.joint_score(context, plan) == plan.joint
     other = with_other_sensor(tmp_path / "other", plan.score)
-    changed = plan_sensors.joint_score(open_run(other, context.folder.path), plan)
+    tried = plan_sensors.try_sensors(context, plan, open_run(other, context.folder.path))
     joint = egvs.JointScore.of(other, tmp_path / "run")
     joint.add("pole_a", "pole_b")
-    assert changed == joint.value
-    assert changed != plan.joint
+    assert tried.joint == joint.value
+    assert tried.joint != plan.joint
+    settings = (f"score.rank_by={plan.score}", "placement.count=2")
+    planned_there = egvs.place(egvs.load(tmp_path / "other", settings), tmp_path / "planned")
+    assert tried.joint_se == pytest.approx(planned_there.joint_se, rel=1e-9)
     higher = replace(plan.sensors[0], z_m=4.0)
     refined = replace(plan, sensors=(higher, *plan.sensors[1:]), refinement=RefinementSummary(*[0.0] * 3, *[0] * 3))
-    assert plan_sensors.joint_score(context, refined) != plan.joint
+    assert plan_sensors.try_sensors(context, refined, open_run(other, context.folder.path)).joint != tried.joint
+
+
+def test_error_of_a_change_is_that_of_paired_blocks(planned: tuple[StageContext, SensorPlan], tmp_path: Path) -> None:
+    """A sensor with the same beams under another name changes nothing, and with certainty."""
+    context, plan = planned
+    twin = with_other_sensor(tmp_path / "other", plan.score, sensor="small_too")
+    tried = plan_sensors.try_sensors(context, plan, open_run(twin, context.folder.path))
+    assert (tried.joint, tried.joint_se) == (plan.joint, pytest.approx(plan.joint_se, rel=1e-9))
+    assert tried.change_se == pytest.approx(0.0, abs=1e-12 * plan.joint)
 
 
 def test_sensor_with_measured_scan_cannot_be_exchanged(
@@ -143,4 +156,10 @@ def test_sensor_with_measured_scan_cannot_be_exchanged(
     context, plan = planned
     other = with_other_sensor(tmp_path / "other", plan.score, "scan.csv")
     with pytest.raises(InputError, match="its empty scan was measured"):
-        plan_sensors.joint_score(open_run(other, context.folder.path), plan)
+        plan_sensors.try_sensors(context, plan, open_run(other, context.folder.path))
+
+
+def test_plan_with_its_own_sensors_is_no_trial(planned: tuple[StageContext, SensorPlan]) -> None:
+    context, plan = planned
+    with pytest.raises(InputError, match="its sensors are these already"):
+        plan_sensors.try_sensors(context, plan, context)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,8 +13,9 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
 from egvs.explore.session import site_blindspots
+from egvs.placement.plan_error import PlanErrors
 from egvs.placement.problem import CoverageState, VisibilityMatrix
-from egvs.placement.problem_builder import make_objective, read_tpogs
+from egvs.placement.problem_builder import build_problem, make_objective, read_tpogs
 from egvs.results.labels import join_names
 from egvs.results.plans import SensorPlan
 from egvs.scoring.blindspots import SpotVisibility, VehicleSpots
@@ -95,31 +96,61 @@ def _share(location: LocationVisibility) -> str:
     return format_percent(location.share, 0)
 
 
-def joint_score(context: StageContext, plan: SensorPlan) -> float:
-    """Return the joint score of the candidates of a plan, with the sensors that the scenario has on them now.
+@dataclass(frozen=True)
+class TriedSensors:
+    """The joint score of a plan with other sensors, with standard errors; NaN where they are unknown.
+
+    Attributes
+    ----------
+    joint, joint_se
+        The joint score.
+    change_se
+        Of its difference from that of the plan, paired by blocks of frames and detectors.
+    """
+
+    joint: float
+    joint_se: float
+    change_se: float
+
+
+def try_sensors(context: StageContext, plan: SensorPlan, changed: StageContext) -> TriedSensors:
+    """Return the joint score of a plan with the sensors that its candidates have in another scenario.
 
     Parameters
     ----------
     context
-        The run that the plan belongs to; only the sensors of its scenario may be others.
+        The run that the plan belongs to.
     plan
         The plan; where it was refined, its sensors stay where that moved them.
+    changed
+        The same folder with a scenario that differs in sensors only.
 
     Raises
     ------
     InputError
-        If a sensor cannot be scanned or scored.
+        If no sensor is another one, or one cannot be scanned or scored.
     """
-    objective = make_objective(context, read_tpogs(context))
-    sites = {site.name: site for site in context.scene.sites}
-    rows = []
-    for planned in plan.sensors:
-        site = sites[planned.site]
-        if site.points is not None and site.sensor != planned.sensor:
+    by_name = {site.name: site for site in changed.scene.sites}
+    sites = [sensor.mount for sensor in plan.sensors]
+    tried = list(range(len(sites)))
+    for number, planned in enumerate(plan.sensors):
+        site = by_name[planned.site]
+        if site.sensor == planned.sensor:
+            continue
+        if site.points is not None:
             problem = "its empty scan was measured, so that of another sensor is unknown"
             raise InputError(f"site {site.name}", problem, "Choose a pole whose scan is simulated.")
-        if plan.refinement is not None:
-            site = replace(site, pose=planned.mount.pose)
-        rows.append(objective.view.row(Beams.of(context.inputs.scanner.scan_site(site))))
+        pose = planned.mount.pose if plan.refinement is not None else site.pose
+        tried[number] = len(sites)
+        sites.append(replace(site, name=f"{site.name}@{site.sensor}", pose=pose))
+    if len(sites) == len(plan.sensors):
+        raise InputError("the plan", "its sensors are these already", "Choose another sensor for one of its poles.")
+
+    objective = make_objective(changed, read_tpogs(changed))
+    rows = [objective.view.row(Beams.of(changed.inputs.scanner.scan_site(site))) for site in sites]
     term = objective.terms(VisibilityMatrix.of(rows, objective.view.n_cells))[""]
-    return CoverageState([term], range(len(rows))).value(term)
+    planned_problem = build_problem(context, lambda _: None)
+    errors = PlanErrors(changed, replace(planned_problem, views=(objective.view,)))
+    plans = [tuple(range(len(plan.sensors))), tuple(tried)]
+    error = errors.of_plans(term, plans, sites, moved=True)[1]
+    return TriedSensors(CoverageState([term], tried).value(term), error.score_se, error.gain_se)

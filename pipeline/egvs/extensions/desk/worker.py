@@ -137,40 +137,46 @@ def try_sensor(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
     from egvs.extensions.desk import plan_sensors
 
     progress.report("scans and scores", 0, 0)
-    with _open_plan(request, request["settings"]) as (context, planned):
-        sensors = {site.name: site.sensor for site in context.scene.sites}
-        if all(sensors[each.site] == each.sensor for each in planned.sensors):
-            raise InputError("the plan", "its sensors are these already", "Choose another sensor for one of its poles.")
-        joint = plan_sensors.joint_score(context, planned)
+    with _open_plan(request) as (context, planned):
+        changed = _open_run(request, request["settings"])
+        tried = plan_sensors.try_sensors(context, planned, changed)
     by = planned.by
-    sign = "+" if joint > planned.joint else ""
+    sign = "+" if tried.joint > planned.joint else ""
+    change = by.change(tried.joint - planned.joint, tried.change_se)
     return {
         "label": by.noun, "before_text": by.with_unit(planned.joint, planned.joint_se),
-        "after_text": by.with_unit(joint),
-        "change_text": f"{sign}{by.change(joint - planned.joint)} {by.change_unit}".rstrip(),
+        "after_text": by.with_unit(tried.joint, tried.joint_se),
+        "change_text": f"{sign}{change} {by.change_unit}".rstrip(),
     }  # fmt: skip
 
 
 @contextmanager
-def _open_plan(request: dict[str, Any], settings: Sequence[str] = ()) -> Iterator[tuple[StageContext, SensorPlan]]:
-    """Open the run of a scenario, and its plan; further settings may change the sensors only."""
+def _open_plan(request: dict[str, Any]) -> Iterator[tuple[StageContext, SensorPlan]]:
+    """Open the run of a scenario, and its plan."""
     from egvs.artefacts.run_folder import RunFolder
-    from egvs.artefacts.run_record import RunRecord
     from egvs.core.digests import use_digests
     from egvs.results.plans import SensorPlan
-    from egvs.runs import stage_registry
     from egvs.runs.run import lock_run_folder
-    from egvs.runs.run_context import open_folder
-    from egvs.scenario.loading import load
 
     folder = Path(request["run"])
     with lock_run_folder(folder):
         planned = SensorPlan.read(RunFolder(folder))
         assert planned is not None, "the plan was removed"
-        recorded = stage_registry.recorded_digests(RunRecord.read(folder))
-        context = open_folder(load(request["scenario"], settings), folder, recorded=recorded)
+        context = _open_run(request)
         with use_digests(context.inputs.digests):
             yield context, planned
+
+
+def _open_run(request: dict[str, Any], settings: Sequence[str] = ()) -> StageContext:
+    """Open the run of a scenario; further settings may change the sensors only."""
+    from egvs.artefacts.run_record import RunRecord
+    from egvs.runs import stage_registry
+    from egvs.runs.run_context import open_folder
+    from egvs.scenario.loading import load
+
+    folder = Path(request["run"])
+    recorded = stage_registry.recorded_digests(RunRecord.read(folder))
+    return open_folder(load(request["scenario"], settings), folder, recorded=recorded)
 
 
 def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
