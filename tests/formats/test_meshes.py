@@ -58,6 +58,7 @@ def hostile() -> Iterator[tuple[str, bytes, str]]:
     yield "m.ply", COMPLETE_FILES["m.ply"][:-20], "cannot be loaded"
     yield "m.ply", ASCII_PLY.replace(b"-0.5", b"-0.5x", 1), "cannot be loaded"
     yield "m.ply", b"ply\n", "m.ply"
+    yield "m.ply", ASCII_PLY.replace(b"element face", "element é".encode()), r"line \d: expected a header in ASCII"
     yield "m.stl", COMPLETE_FILES["m.stl"][:-20], "m.stl"
     yield "m.stl", COMPLETE_FILES["text.stl"].replace(b"0.5", b"0.x", 1), "cannot be loaded"
     yield "m.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "m.obj"

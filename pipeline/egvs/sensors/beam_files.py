@@ -375,9 +375,14 @@ def _check_lasers(path: Path, rows: list[list[str]], column: int) -> None:
 
 
 def _check_width(where: str, row: list[str], width: int) -> None:
-    if len(row) > width:  # e.g. a decimal comma, which shifts all following values by one column
+    if len(row) != width:  # e.g. a decimal comma, which shifts all following values by one column
         problem = f"expected {width} values, one per column, got {len(row)}"
-        raise InputError(where, problem, "Use decimal points, not decimal commas.")
+        hint = (
+            "Use decimal points, not decimal commas."
+            if len(row) > width
+            else "Check the header, and the end of the row."
+        )
+        raise InputError(where, problem, hint)
 
 
 def _cell(row: list[str], column: int) -> str:

@@ -215,7 +215,9 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         desk.ok("POST", "/api/trial", {"site": "pole_b", "sensor": "VLP-16"})
         tried = desk.wait()["result"]
         assert (tried["site"], tried["sensor"], tried["label"]) == ("pole_b", "VLP-16", "EGVS")
-        assert re.fullmatch(r"\+[\d,]+ ± [\d,]+ bit", tried["change_text"]) and tried["before_text"] != tried["after_text"]
+        assert (
+            re.fullmatch(r"\+[\d,]+ ± [\d,]+ bit", tried["change_text"]) and tried["before_text"] != tried["after_text"]
+        )
         desk.ok("POST", "/api/trial", {"site": "pole_a", "sensor": "VLP-16"})
         assert "sensors are these already" in desk.wait("failed")["message"]
         assert desk.refused("POST", "/api/trial", {"site": "pole_b", "sensor": "none"})[::2] == (422, "sensor")

@@ -26,8 +26,8 @@ class Download:
         The command that makes it, without the run; empty if it is there already.
     made
         What the command writes, relative to the run folder: a file, a folder, or a pattern.
-    libraries
-        Optional libraries that it needs.
+    libraries, extra
+        Optional libraries that it needs, and the extra of this package that installs them.
     needs_command
         Command of an extension that makes it.
     """
@@ -37,6 +37,7 @@ class Download:
     words: tuple[str, ...] = ()
     made: str = ""
     libraries: tuple[str, ...] = ()
+    extra: str = ""
     needs_command: str = ""
 
     def reason(self, commands: set[str]) -> str:
@@ -44,7 +45,7 @@ class Download:
         if self.needs_command and self.needs_command not in commands:
             return f"the command egvs {self.needs_command} is not installed"
         missing = [name for name in self.libraries if find_spec(name) is None]
-        return f"{', '.join(missing)} is not installed" if missing else ""
+        return f"{', '.join(missing)} is not installed: pip install 'egvs[{self.extra}]'" if missing else ""
 
     def files(self, run: Path) -> list[Path]:
         """Return the files that were made, the latest first."""
@@ -64,12 +65,12 @@ def list_downloads() -> Iterator[Download]:
     """Yield everything that a run offers."""
     yield Download("report", "Report", (), RunFolder.report.name)
     page = f"{EXPORT_FOLDER}/view.html"
-    yield Download("page", "3D view as one page", ("explore", "--to", page), page, ("viser", "PIL"))
-    yield Download("sheets", "Installation sheets", ("sheets",), "sheets", (), "sheets")
+    yield Download("page", "3D view as one page", ("explore", "--to", page), page, ("viser", "PIL"), "explore")
+    yield Download("sheets", "Installation sheets", ("sheets",), "sheets", needs_command="sheets")
     for name, title in _TITLES.items():
         kind = FORMATS[name]
         made = f"{EXPORT_FOLDER}/*{kind.suffix}" if kind.is_one_file else f"{EXPORT_FOLDER}/{name}"
-        yield Download(name, title, ("export", "--to", name), made, kind.libraries)
+        yield Download(name, title, ("export", "--to", name), made, kind.libraries, kind.extra)
 
 
 def find_download(identifier: str) -> Download | None:

@@ -52,6 +52,9 @@ _SETTINGS = {
 _WHOLE = ("frames", "seed")
 KEEP_RESULTS = "keep_results"
 """Key of a change that says whether the results of the run have to stay current (:meth:`Project.protect_results`)."""
+_UNCOUNTED = "traffic that was not counted"
+"""What ``assumed`` says after counts were typed."""
+
 _OF_MAP_NAME = re.compile(r"(lamp|signal|pole)\d+")
 
 
@@ -478,7 +481,11 @@ class Project:
                     raise RefusalError(404, f"there is no movement {index[:20]!r}", "", index[:20])
                 number = parse_number(value, index, 0.0, 1e5)
                 table.rows[int(index)]["count"] = f"{number:.12g}"
-            self._change("counts", {**self._contents, name: table.to_text()})
+            document = tomlkit.parse(self._contents[SCENARIO_FILE])
+            for number, text in enumerate(document.get("assumed", [])):
+                if str(text).startswith("traffic ("):
+                    document["assumed"][number] = _UNCOUNTED
+            self._change("counts", {**self._contents, name: table.to_text(), SCENARIO_FILE: tomlkit.dumps(document)})
 
     def _why_no_counts(self, name: str) -> str:
         return "" if name in self._contents else "There is no table of counts in the scenario's folder."

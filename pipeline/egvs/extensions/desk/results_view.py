@@ -13,12 +13,16 @@ from egvs.artefacts import parquet
 from egvs.artefacts.frame_boxes import read_boxes
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, collect_warnings
 from egvs.core.grid import Grid
 from egvs.core.wording import format_percent
 from egvs.placement import problem_builder
+from egvs.report import sensor_text
+from egvs.report.plan_section import plan_headline
+from egvs.report.reliability import by_severity
+from egvs.results.levels import read_levels
 from egvs.results.plans import SensorPlan
-from egvs.results.ranking import Ranking, describe_mount
+from egvs.results.ranking import Ranking, describe_mount, site_titles
 from egvs.runs import run_sources
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import PlacementConfig
@@ -100,7 +104,8 @@ def describe_ranking(folder: Path) -> dict[str, Any]:
             "rank": rank, "pole": pole.name, "site": best.site, "mount_text": describe_mount(best),
             "score": _finite(best.score), "score_text": by.with_unit(best.score, se),
         })  # fmt: skip
-    return {"label": by.head, "noun": by.noun, "poles": poles}
+    warnings = by_severity(collect_warnings(stage.summary for stage in RunRecord.read(folder).stages.values()))
+    return {"label": by.head, "noun": by.noun, "poles": poles, "warnings": [str(warning) for warning in warnings]}
 
 
 def describe_traffic(folder: Path) -> dict[str, Any]:
@@ -120,12 +125,15 @@ def describe_traffic(folder: Path) -> dict[str, Any]:
     return {"moments": moments, "first_s": round(first * period_s, 3), "period_s": period_s}
 
 
-def describe_plan(folder: Path, adds: Mapping[str, list[str]]) -> dict[str, Any] | None:
+def describe_plan(folder: Path, scenario: Scenario, adds: Mapping[str, list[str]]) -> dict[str, Any] | None:
     """Return the plan of a run, with sentences on what each sensor ``adds``, by its site; None without a plan."""
-    plan = SensorPlan.read(RunFolder(folder))
+    files = RunFolder(folder)
+    plan = SensorPlan.read(files)
     if plan is None:
         return None
     by = plan.by
+    groups = read_levels(files.levels, Ranking.read(files.scores).sites[0].site) if files.levels.is_file() else ()
+    level = sensor_text.plan_level(scenario, [sensor.sensor for sensor in plan.sensors], groups)
     sensors = [
         {
             "order": each.order, "site": each.site, "pole": each.pole, "z_m": each.z_m, "pitch_deg": each.pitch_deg,
@@ -143,6 +151,7 @@ def describe_plan(folder: Path, adds: Mapping[str, list[str]]) -> dict[str, Any]
     )  # fmt: skip
     return {
         "requested": {key: plan.request[key] for key in ("count", "budget", "reach") if plan.request.get(key)},
+        "headline": plan_headline(plan, site_titles(plan.sensors), level),
         "label": by.head, "unit": "%" if by.is_share else by.unit, "change_unit": by.change_unit, "sensors": sensors,
         "curve": curve, "score_text": by.with_unit(plan.joint, plan.joint_se), "cost": plan.cost,
         "certificate": _finite(plan.certificate), "certificate_text": proof,

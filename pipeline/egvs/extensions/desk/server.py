@@ -437,7 +437,9 @@ class Desk:
     def show_plan(self, _body: Body) -> Answer:
         """Return the plan."""
         made, adds = self._additions
-        plan = results_view.describe_plan(self.project.run_folder, adds if made == self._plan_made else {})
+        plan = results_view.describe_plan(
+            self.project.run_folder, self.project.scenario, adds if made == self._plan_made else {}
+        )
         if plan is None:
             raise RefusalError(404, "There is no plan yet.", "Ask for a number of sensors, or give a budget.")
         return {"outdated": self.project.run_state()["plan_outdated"], **plan}

@@ -6,7 +6,12 @@ import { fieldText, parseNumber } from "./numbers.js";
 /** Texts that were refused, by the key of their field: they stay until they are corrected. @type {Map<string, {text: string, reason: string}>} */
 const refused = new Map();
 
-export const forgetRefused = () => refused.clear();
+/** Forget them. @returns {string[]} the reasons */
+export function takeRefused() {
+  const reasons = [...refused.values()].map(({ reason }) => reason);
+  refused.clear();
+  return reasons;
+}
 
 let lastId = 0;
 const newId = () => `f${++lastId}`;

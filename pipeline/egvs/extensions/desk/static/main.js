@@ -2,7 +2,7 @@
 import { listen } from "./api.js";
 import { byId, focusHeading, h, keepingFocus, show } from "./dom.js";
 import { change, data, fetchStart, fetchState, isBusy, onChange, say, settled, takeJob, update } from "./store.js";
-import { forgetRefused } from "./fields.js";
+import { takeRefused } from "./fields.js";
 import { drawJob } from "./progress.js";
 import { drawStart } from "./start.js";
 import { drawPoles } from "./poles.js";
@@ -40,8 +40,9 @@ function go(id) {
 function readStep() {
   const step = STEPS.some(({ id }) => `#${id}` === location.hash) ? location.hash.slice(1) : "poles";
   if (step === data.step) return;
-  forgetRefused();
+  const refused = takeRefused();
   update({ step, isAdding: false, suggestions: null });
+  if (refused.length) say(`Not taken: ${refused.join(" ")}`, "error");
   byId("panel").scrollTop = 0;
 }
 
@@ -132,6 +133,7 @@ onChange(draw);
 onChange((changed) => {
   if (changed.has("project") && !data.project) fetchStart();
   const page = data.project?.id ?? data.upload?.id ?? "";
+  if (page !== shownPage) byId("panel").scrollTop = 0;
   if (page !== shownPage && document.activeElement === document.body) setTimeout(() => focusHeading(byId("panel")));
   shownPage = page;
 });

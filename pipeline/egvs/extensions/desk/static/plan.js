@@ -134,6 +134,7 @@ function drawResult(plan) {
   const hasCost = plan.sensors.some((/** @type {any} */ sensor) => sensor.cost);
   return h("section", {},
     h("h2", {}, plan.outdated ? "Plan before the changes" : `${plan.sensors.length} ${plan.sensors.length === 1 ? "sensor" : "sensors"}: ${plan.score_text} ${plan.label}`),
+    !plan.outdated && h("p", {}, `${plan.headline}.`),
     h("p.quiet", {}, `${capitalised(plan.certificate_text)}.`, hasCost && ` Costs ${readable(plan.cost)}.`),
     h("ol.sensors", {}, plan.sensors.map((/** @type {any} */ sensor) => sensorItem(sensor, ` ${plan.change_unit}`))),
     curve(plan),

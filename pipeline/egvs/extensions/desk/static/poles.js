@@ -33,7 +33,7 @@ export function drawPoles(panel) {
     data.suggestions && h("p.quiet", {}, data.suggestions.length ? "Click a ring on the map to add a pole there." : "No other position at the kerbs is free."),
     sites.length > 0 && legend(),
     chosen && details(chosen, isLocked),
-    sites.length > 0 && h("h2", {}, `${sites.length} candidates`),
+    sites.length > 0 && h("h2", {}, sites.length === 1 ? "1 candidate" : `${sites.length} candidates`),
     sites.length > 0 && pagedTable({
       key: "poles", caption: "Candidate poles", rows: sites, redraw: () => update({ project }), isSelected: (site) => site.site === data.selected,
       columns: [

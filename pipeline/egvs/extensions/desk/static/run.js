@@ -32,6 +32,9 @@ export function drawRun(panel) {
       run.state === "complete" && button("Save the report", () => save({ id: "report", title: "Report" }), { isDisabled: isBusy() })),
     job?.kind === "run" && job.state === "failed" && h("p.reason", { role: "alert" }, job.message, job.hint && ` ${job.hint}`),
     checked?.key === filesKey() && problems(checked),
+    ranking?.warnings.length > 0 && h("details.card.warnings", {},
+      h("summary", {}, ranking.warnings.length === 1 ? "1 warning" : `${ranking.warnings.length} warnings, the most serious first`),
+      h("ul", {}, ranking.warnings.map((/** @type {string} */ text) => h("li", {}, text)))),
     ranking && drawRanking(ranking),
     ranking && drawReplay());
 }
