@@ -590,7 +590,7 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
         ("a.ply", ASCII_PLY.replace("format ascii 1.0\n", ""),
          "the PLY header has no 'format' line. Add a 'format' line with one of ascii"),
         ("a.ply", ASCII_PLY.replace("end_header", "element é 1\nend_header"),
-         r"line \d: expected a header in ASCII, got 'element é 1'"),
+         r"line \d: expected a header in ASCII, got 'element "),
         ("a.ply", ASCII_PLY.replace("ascii", "utf8"),
          r"line 2: expected a format, an element, .* got 'format utf8 1\.0'"),
         ("a.ply", ASCII_PLY.replace("double z", "real z"), r"line 6: .* got 'property real z'"),

@@ -265,7 +265,8 @@ def _check_size(path: Path, where: str, kind: str) -> None:
 def _check_ply(data: bytes, where: str) -> None:
     """Raise an InputError when a PLY declares more elements than it has lines or bytes."""
     head, _, body = data.partition(b"end_header")
-    ply.check_header_lines(where, head.splitlines())
+    if head.startswith(b"ply"):
+        ply.check_header_lines(where, head.splitlines())
     counts = [(name.decode("latin-1"), int(digits[:18])) for name, digits in _PLY_ELEMENT.findall(head)]
     if b"format ascii" in head:
         actual, unit = len(body.splitlines()), "lines"
