@@ -240,6 +240,13 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         assert desk.project["run"]["state"] == "outdated"
         assert (tmp_path / "work" / "runs" / "mini" / "scores.parquet").read_bytes() == before
 
+        desk.ok("POST", "/api/plan", {"count": 2})  # of the moved pole: the ranking follows
+        desk.wait()
+        assert (desk.project["run"]["state"], desk.ok("GET", "/api/plan")["outdated"]) == ("complete", False)
+        assert not desk.ok("GET", "/api/ranking")["outdated"]
+        desk.ok("POST", "/api/undo", {"keep_results": False})
+        assert (desk.project["run"]["state"], desk.ok("GET", "/api/ranking")["outdated"]) == ("outdated", True)
+
 
 def test_mistakes_with_maps_are_explained(desk: Client) -> None:
     dropped = desk.ok("POST", "/api/maps?name=broken.osm", b"<osm><script>alert(1)</script>")

@@ -367,6 +367,9 @@ def test_impossible_counts_are_shown_at_once(town: Any) -> None:
     field.press("Escape")
     assert field.get_attribute("aria-invalid") is None
     assert town.get_by_role("button", name="Undo").is_disabled()
+    field.fill("1.200")
+    town.get_by_role("button", name="Next: Run").click()
+    town.locator("#message.error", has_text="Not taken: “1.200” can be 1200 or 1.200.").wait_for()
 
 
 def test_numbers_of_a_german_browser(folder: Path, made_town: Path, open_page: Callable[..., Any]) -> None:

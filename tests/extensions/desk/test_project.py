@@ -162,6 +162,10 @@ def test_counts_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
     assert [each["count_per_h"] for each in after["movements"][:2]] == [120, 45.5]
     assert after["total_per_h"] == before["total_per_h"] + 120 + 45.5 - 65 - 43
     assert [count.per_hour for count in load(tmp_path / "work" / "town").traffic.counts[:2]] == [120, 45.5]
+    assert town.project["assumed"][0] == "traffic that was not counted"
+    town.ok("POST", "/api/undo", {})
+    assert "from the road classes" in town.project["assumed"][0]
+    town.ok("POST", "/api/redo", {})
     first = after["movements"][0]
     assert (first["approach"], first["turn"]) == ("East Street (east)", "straight")
     assert first["from_m"][0] > 205 and first["to_m"][0] < 195  # from the east to the west
