@@ -114,16 +114,16 @@ def run_stages(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
 
 
 def plan(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
-    """Plan several sensors, as ``egvs place``, of results that are up to date; then as :func:`describe_additions`."""
+    """Plan several sensors, as ``egvs place``, and bring the ranking up to date; then as :func:`describe_additions`."""
     from egvs.extensions.desk import results_view
     from egvs.placement.plan import place
     from egvs.runs.run_sources import SettingsSource
     from egvs.scenario.loading import load
 
-    if results_view.describe_run(Path(request["run"]), load(request["scenario"]))["state"] != "complete":
-        run_stages(progress, request)
     scenario = SettingsSource.of(Path(request["scenario"])).load_with_request(request["request"])
     place(scenario, request["run"], progress=progress.report, listener=progress.stage_event)
+    if results_view.describe_run(Path(request["run"]), load(request["scenario"]))["state"] != "complete":
+        run_stages(progress, request)
     return describe_additions(progress, request)
 
 

@@ -27,7 +27,7 @@ export function drawPlan(panel) {
   show(panel,
     h("h1", {}, "Decide"),
     hasResults
-      ? h("p.todo", {}, !plan ? "How many sensors? The best poles for them follow." : plan.outdated ? "Something has changed since. Find the plan again, or undo the change." : "The best poles for these sensors. Try other numbers, or drag a sensor to see its score.")
+      ? h("p.todo", {}, !plan ? "How many sensors? The best poles for them follow." : plan.outdated ? "Something has changed since. Find the plan again, or undo the change." : "The best poles for these sensors. Try other numbers, or drag a sensor to see what it would find alone.")
       : h("p.todo", {}, "Run first: the plan needs the scores of the poles."),
     hasResults && chooser(),
     plan && drawResult(plan),
