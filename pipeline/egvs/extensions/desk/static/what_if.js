@@ -51,7 +51,7 @@ function obstacleRow(obstacle) {
     key: `${obstacle.name}.${key}`, label, unit, value: obstacle[key], limits: { min: unit === "m" ? 0.1 : -360, max: unit === "m" ? 100 : 360 },
     send: (value, refuse) => saveObstacles(data.project.obstacles.map((/** @type {any} */ other) => (other.name === obstacle.name ? { ...other, [key]: value } : other)), refuse),
   });
-  return h("li", {}, h("div", {}, h("b", {}, obstacle.name), h("div.pair", {}, field("yaw_deg", "Direction", "°"), field("height_m", "Height", "m"), field("length_m", "Length", "m"), field("width_m", "Width", "m"))),
+  return h("li", {}, h("div", {}, h("b", {}, obstacle.name), h("div.pair", {}, field("yaw_deg", "Direction (0° east, 90° north)", "°"), field("height_m", "Height", "m"), field("length_m", "Length", "m"), field("width_m", "Width", "m"))),
     button("Remove", () => saveObstacles(others), { key: `remove.${obstacle.name}`, isDisabled: isBusy(), title: `Remove ${obstacle.name}` }));
 }
 
