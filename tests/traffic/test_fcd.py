@@ -52,14 +52,14 @@ ROWS = {
 }
 
 
-def parquet_bytes(name=b"b"):
+def parquet_bytes(name=b"b", x=(float("nan"), 1.0, -1.25, 2.5)):
     nan = float("nan")
     names = pa.array([b"", name, b"a", name]).view(pa.string())
     table = pa.table(
         {
             "timestep_time": [0.0, 0.5, 0.5, 1.0],
             "vehicle_id": names,
-            "vehicle_x": [nan, 1.0, -1.25, 2.5],
+            "vehicle_x": list(x),
             "vehicle_y": [nan, 2.0, 1000.0, 2.0],
             "vehicle_angle": pa.array([nan, 90.0, 360.0, 90.0], pa.float32()),
             "vehicle_type": ["", "car", "bus", "car"],
@@ -207,6 +207,10 @@ BAD = {
     "Parquet with a name that is no text": (
         parquet_bytes().replace(b"vehicle_angle", b"vehicle\xffangle"),
         r"cannot be read as Parquet \(it is not utf-8 text: byte 7 is 0xff\)",
+    ),
+    "Parquet with texts in place of numbers": (
+        parquet_bytes(x=("", "1", "west", "2.5")),
+        r"vehicle_x: expected a column of numbers, got string",
     ),
     "Parquet with an id that is no text": (parquet_bytes(b"\xff"), r"cannot be read as Parquet \(.*UTF8"),
     "infinite speed": (

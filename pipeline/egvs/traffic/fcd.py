@@ -16,7 +16,7 @@ import itertools
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -270,6 +270,7 @@ def _read_parquet(path: Path) -> Generator[pa.RecordBatch, None, None]:
     with _translate_parquet_errors(path), _open_seekable(path) as source:
         with pq.ParquetFile(source) as file:
             columns = _source_columns(file.schema_arrow.names, path, "vehicle")
+            _check_types(file.schema_arrow, columns, path)
             _check_rows(file.metadata.num_rows, source, path)
             largest = max(arrow_bounds.parquet_group_bytes(file, source, list(columns.values()), path), default=0)
             problem = f"has a row group of {largest / limits.MB:,.0f} MB after decompression"
@@ -283,6 +284,15 @@ def _read_parquet(path: Path) -> Generator[pa.RecordBatch, None, None]:
                     texts = arrow_bounds.decode_texts(batch.column(name), f"{path}: {name}")
                     batch = batch.set_column(batch.schema.get_field_index(name), name, texts)
                 yield batch
+
+
+def _check_types(schema: pa.Schema, columns: Mapping[str, str], path: Path) -> None:
+    """Raise an InputError for a column of other values where numbers are expected."""
+    for name, column in columns.items():
+        kind = schema.field(column).type
+        is_number = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind)
+        if name not in _STRINGS and not is_number:
+            raise InputError(f"{path}: {column}", f"expected a column of numbers, got {kind}", EXPECTED_FCD)
 
 
 def _translate_parquet_errors(path: Path) -> AbstractContextManager[None]:
