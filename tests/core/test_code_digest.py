@@ -168,7 +168,7 @@ MOST_LINES = {
     "check": 20_080,  # with comparisons of heights, sizes and speeds, of vehicles with roads and of limits, and plans
     "statics": 11_310,  # with the repair of polygons, and plans of signals, in German, too
     "scan": 14_500,  # 330 of them read the files of beams that makers give and offices write
-    "traffic": 11_810,  # with plans of junctions, limits of sizes, and maps read in a process of their own
+    "traffic": 11_820,  # with plans of junctions, limits of sizes, and maps read in a process of their own
     "tpog": 4_510,  # with counts that are made while SUMO goes on, and the surfaces that effects lose returns on
     "score": 19_560,  # losses of returns are part of every score; what people notice, and levels of groups
     "report": 22_920,  # with the level of plans

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -205,3 +205,11 @@ def _describe_error(error: BaseException) -> str:
     if "integer string conversion" in text:
         return "a number has too many digits"
     return text
+
+
+def check_ply_header(where: str, lines: Sequence[bytes]) -> None:
+    """Raise an InputError for a line of a PLY header, other than a comment, that is not in ASCII."""
+    for number, line in enumerate(lines, 1):
+        if not (line.isascii() or line.startswith((b"comment", b"obj_info"))):
+            text = line.decode("utf-8", "replace").strip()[:60]
+            raise InputError(f"{where}: line {number}", f"expected a header in ASCII, got {text!r}", COMPLETE_FILE)

@@ -33,7 +33,6 @@ from egvs.core.errors import InputError
 from egvs.core.grid import BoolArray, IntArray
 from egvs.core.platform import relative_path
 from egvs.core.reading import translate_errors
-from egvs.formats import ply
 
 if TYPE_CHECKING:
     import trimesh
@@ -266,7 +265,7 @@ def _check_ply(data: bytes, where: str) -> None:
     """Raise an InputError when a PLY declares more elements than it has lines or bytes."""
     head, _, body = data.partition(b"end_header")
     if head.startswith(b"ply"):
-        ply.check_header_lines(where, head.splitlines())
+        reading.check_ply_header(where, head.splitlines())
     counts = [(name.decode("latin-1"), int(digits[:18])) for name, digits in _PLY_ELEMENT.findall(head)]
     if b"format ascii" in head:
         actual, unit = len(body.splitlines()), "lines"

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.reading import COMPLETE_FILE
+from egvs.core.reading import COMPLETE_FILE, check_ply_header
 from egvs.formats.point_clouds import AXES, RecordLayout, pack_records, parse_count
 
 _HEADER = "ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}end_header\n"
@@ -113,14 +113,6 @@ def _formats(where: str, element: _Element, order: str) -> list[str]:
     return formats
 
 
-def check_header_lines(where: str, lines: Sequence[bytes]) -> None:
-    """Raise an InputError for a line of a PLY header, other than a comment, that is not in ASCII."""
-    for number, line in enumerate(lines, 1):
-        if not (line.isascii() or line.startswith((b"comment", b"obj_info"))):
-            text = line.decode("utf-8", "replace").strip()[:60]
-            raise InputError(f"{where}: line {number}", f"expected a header in ASCII, got {text!r}", COMPLETE_FILE)
-
-
 def _read_header(where: str, data: bytes) -> _Header:
     stop = data.find(b"\nend_header")
     if not data.startswith(b"ply") or stop < 0:
@@ -128,7 +120,7 @@ def _read_header(where: str, data: bytes) -> _Header:
     start = data.find(b"\n", stop + 1) + 1 or len(data)
     order, elements = "", list[_Element]()
     lines = data[:start].splitlines()
-    check_header_lines(where, lines)
+    check_ply_header(where, lines)
     for number, line in enumerate((line.decode("latin-1") for line in lines), 1):
         match line.split():
             case ["format", kind, _] if kind in _ORDERS:
