@@ -117,10 +117,11 @@ def rows(data: bytes) -> object:
 
 
 def _cells(text: str) -> list[list[str]]:
-    """Cells of a CSV; between semicolons, a decimal comma is a point."""
-    is_german = ";" in (head := text.partition("\n")[0]) and "," not in head
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=";" if is_german else ",")
-    return [[cell.strip().replace(",", ".") if is_german else cell.strip() for cell in row] for row in rows if row]
+    """Cells of a CSV; between semicolons or tabs, a decimal comma is a point."""
+    head = text.partition("\n")[0]
+    mark = "," if "," in head else next((other for other in ";\t" if other in head), ",")
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=mark)
+    return [[cell.strip() if mark == "," else cell.strip().replace(",", ".") for cell in row] for row in rows if row]
 
 
 def table(data: bytes) -> object:
