@@ -270,11 +270,11 @@ def _read_parquet(path: Path) -> Generator[pa.RecordBatch, None, None]:
     with _translate_parquet_errors(path), _open_seekable(path) as source:
         with pq.ParquetFile(source) as file:
             columns = _source_columns(file.schema_arrow.names, path, "vehicle")
-            _check_types(file.schema_arrow, columns, path)
             _check_rows(file.metadata.num_rows, source, path)
             largest = max(arrow_bounds.parquet_group_bytes(file, source, list(columns.values()), path), default=0)
             problem = f"has a row group of {largest / limits.MB:,.0f} MB after decompression"
             limits.UNPACKED.check_bytes(path, largest, problem)
+            _check_types(file.schema_arrow, columns, path)
         # Texts stay encoded until their length is checked: a long one may occur in each row.
         with pq.ParquetFile(source, read_dictionary=[columns[name] for name in _STRINGS]) as file:
             for batch in file.iter_batches(_BATCH_ROWS, columns=list(columns.values())):
