@@ -60,7 +60,7 @@ def test_ground_is_the_terrain_beyond_the_roads(flat_road: Path, tmp_path: Path)
     assert np.ptp(flat.vertices_m[:, 2]) == 0
 
 
-def test_heights_beside_repeated_points_are_those_of_the_plane() -> None:
+def test_heights_near_repeated_points_are_those_of_the_plane() -> None:
     """SciPy does not say which triangles are at repeated points."""
     rng = np.random.default_rng(5)
     xy_m = rng.uniform(0, 10, (8, 2))[rng.integers(8, size=200)]

@@ -323,7 +323,7 @@ def test_tables_of_poles_fit_the_terminal(width: int, runs: int, monkeypatch: py
         assert "kerb_0@4.5m-10deg" in first_rows[0]
 
 
-def test_mounts_upside_down_are_told_from_upright_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_upright_and_inverted_mounts_differ(monkeypatch: pytest.MonkeyPatch) -> None:
     upright = mounts("s", 0.9)
     hung = [replace(site, roll_deg=180.0, sensor="t") for site in mounts("s", 0.8)]
     row = next(

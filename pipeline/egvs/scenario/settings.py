@@ -74,8 +74,8 @@ def _format_toml(value: Any) -> str:
 def changed_settings(base: Mapping[str, Any], values: Mapping[str, Any]) -> Settings:
     """Return the settings of ``values`` that differ from those of ``base``, by full key, sorted.
 
-    A setting that only ``base`` has is None. 5 and 5.0 are equal, and so are None and a missing key. Settings without
-    effect beside others (:func:`without_replaced`) are left out.
+    A setting that only ``base`` has is None. 5 and 5.0 are equal, and so are None and a missing key. Settings that
+    others replace (:func:`without_replaced`) are left out.
 
     Parameters
     ----------

@@ -113,6 +113,7 @@ def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:
     ranking = desk.ok("GET", "/api/ranking")
     assert sorted(pole["pole"] for pole in ranking["poles"]) == ["lamp1", "new1", "signal1"]
     assert not ranking["outdated"]
+    assert any("60 frames" in warning for warning in ranking["warnings"])
     traffic = desk.ok("GET", "/api/traffic")
     assert (len(traffic["moments"]), traffic["first_s"], traffic["period_s"]) == (60, 0.0, 1.0)
     recorded = pq.read_table(tmp_path / "work" / "runs" / "town" / "trajectories.parquet").to_pylist()
@@ -132,6 +133,7 @@ def test_from_a_map_to_a_plan(desk: Client, tmp_path: Path) -> None:
     assert (len(plan["sensors"]), plan["requested"]) == (2, {"count": 2})
     assert 0.9 < plan["certificate"] <= 1
     assert all(sensor["adds_text"] for sensor in plan["sensors"])
+    assert re.match(r"The plan of 2 sensors should find \d+", plan["headline"])
     desk.ok("POST", "/api/plan", {"count": 99})
     assert "at most" in desk.wait("failed")["message"]
 

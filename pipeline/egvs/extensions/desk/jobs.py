@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from egvs.core.errors import EgvsError
@@ -50,7 +50,7 @@ def _close_pipes(process: subprocess.Popen[str]) -> None:
 
 
 def ask_worker(request: dict[str, Any]) -> dict[str, Any]:
-    """Return the result of a short job, so that what it loads leaves the memory; RefusalError if there is none."""
+    """Return the result of a short job, whose libraries then leave the memory; RefusalError if the job fails."""
     process = start_worker(request)
     assert process.stdout is not None and process.stderr is not None
     messages = [json.loads(line) for line in process.stdout]
@@ -59,10 +59,15 @@ def ask_worker(request: dict[str, Any]) -> dict[str, Any]:
     _close_pipes(process)
     end = messages[-1] if messages else {}
     if "result" not in end:
-        unexplained = log[-1] if log else f"it ended with code {process.returncode}"
-        raise RefusalError(409, end.get("error", unexplained), end.get("hint", ""))
+        raise RefusalError(409, _why_failed(end, log, process.returncode), end.get("hint", ""))
     result: dict[str, Any] = end["result"]
     return result
+
+
+def _why_failed(end: dict[str, Any], log: Sequence[str], code: int) -> str:
+    """Return what the last message of a worker, else the last line of its log, says."""
+    unexplained = log[-1] if log else f"it ended with code {code}"
+    return str(end.get("error", unexplained))
 
 
 class Job:
@@ -151,8 +156,7 @@ class Job:
         elif self._is_stopped:
             final |= {"state": "stopped", "message": "Stopped. What finished stages made is kept."}
         else:
-            unexplained = self._log[-1] if self._log else f"it ended with code {self._process.returncode}"
-            message = end.get("error", unexplained)
+            message = _why_failed(end, self._log, self._process.returncode)
             for path, name in self._names.items():
                 message = message.replace(path, name)
             final |= {"state": "failed", "message": message, "hint": end.get("hint", "")}
