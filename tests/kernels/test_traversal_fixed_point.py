@@ -3,6 +3,7 @@
 Evidence: rational arithmetic on the march's hostile corpus and on what Hypothesis makes up; beams of a whole sensor
 against the exact march; how few beams are left to that; faults put into the source on purpose."""
 
+import itertools
 import re
 from functools import cache
 from pathlib import Path
@@ -140,6 +141,32 @@ def test_reports_uncertain_beams(shape, voxel_m, o):
     assert traversal.traverse_fixed_point(o, np.array([3.3, 0.1, 0.2]), shape, near, np.empty(20, np.uint32)) == -1
 
 
+@pytest.mark.parametrize("axes", list(itertools.permutations(range(3))))
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_margins_are_as_wide_as_the_bounds_and_hardly_wider(axes, side):
+    """With S = 60 + 70: 16 u S for rounding; beside it the chord, and a digit for the start and for each step."""
+    shape, o = np.array([60, 40, 10])[list(axes)], np.array([side * 70.0, 3.0, -8.0])[list(axes)]
+    near, digit = traversal.make_tolerances(o, shape, 2.0**-38), 2.0**-40
+    assert near.chord == 2.0**-38
+    assert near.rounding == 16 * 2.0**-53 * 130
+    assert near.chord + near.rounding + 61 * digit < near.plane < 1.002 * near.chord + near.rounding + 65 * digit
+
+
+@pytest.mark.parametrize("axes", list(itertools.permutations(range(3))))
+def test_largest_grids_that_have_margins(axes):
+    """Up to 2^20 voxels along an axis, 2^32 in all, and margins of a tenth of a voxel."""
+    for shape, chord, is_certain in (
+        ((2**20, 2**6, 2**6), 1e-6, True),
+        ((2**20 + 1, 2**6, 1), 1e-6, False),
+        ((2**12, 2**12, 2**8), 1e-6, True),
+        ((2**12, 2**12, 2**8 + 1), 1e-6, False),
+        ((60, 40, 10), 0.099, True),
+        ((60, 40, 10), 0.101, False),
+    ):
+        near = traversal.make_tolerances(np.full(3, 0.5), np.array(shape)[list(axes)], chord)
+        assert (near.plane < np.inf) == is_certain
+
+
 @pytest.mark.slow
 def test_margin_covers_truncation_of_a_million_steps():
     """Each step is nearly a digit too short, so y is wrong by some 1e-6 where it has just passed a plane: not certain.
@@ -219,6 +246,17 @@ def hard_beams():
 
 
 CASES = [*(in_voxels(entry) for entry in SOUND if is_near(entry, False)), *hard_beams()]
+
+
+def test_hard_beams_agree_with_rational_arithmetic():
+    for o, d, shape, voxel_m in CASES:
+        assert agrees_with_exact_march(traversal, o, d, shape, voxel_m)
+        expected = exact(tuple(o), tuple(d), tuple(shape), voxel_m)
+        if expected is not None:
+            hits = np.zeros(shape, np.int64)
+            weights = np.array([3])
+            traversal.add_hits(o, np.array([d]), np.array(shape), voxel_m, weights, hits.reshape(-1))
+            assert {tuple(cell) for cell in np.argwhere(hits == 3).tolist()} == expected
 
 
 @pytest.mark.slow
