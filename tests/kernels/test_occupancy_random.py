@@ -1,0 +1,132 @@
+"""Which voxels do random boxes, triangles and solids fill?
+
+Evidence: slow twins that try every voxel, in float64: separating axes, solid angles; triangles clipped in rationals."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from egvs.kernels import occupancy
+from tests.kernels.test_occupancy_solids import box, check_triangle, prism, solid_angles, sphere
+from tests.oracles import boxes as oracle
+
+VOXEL_M = 0.25
+SHAPES = [(8, 7, 5), *itertools.permutations((9, 4, 2))]
+
+
+def random_boxes(shape, n, seed):
+    """Boxes in and beside the grid, half of them pitched, from slabs to cubes."""
+    rng = np.random.default_rng(seed)
+    middles = rng.uniform(-0.3, 1.3, (n, 3)) * np.array(shape) * VOXEL_M
+    angles = np.column_stack([rng.uniform(-4, 4, n), rng.uniform(-1.6, 1.6, n) * rng.integers(0, 2, n)])
+    return np.column_stack([middles, angles, 10 ** rng.uniform(-2, 0.3, (n, 3))])
+
+
+def float_axes(yaw_rad, pitch_rad):
+    return np.array(oracle.axes_of(math.sin(yaw_rad), math.cos(yaw_rad), math.sin(pitch_rad), math.cos(pitch_rad)))
+
+
+def is_occupied(values, shape):
+    """For each voxel of a grid, by all fifteen axes: whether the box reaches deeper into it than 0.1 mm."""
+    low = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) * VOXEL_M
+    gap, half = low + VOXEL_M / 2 - values[:3], values[5:] / 2
+    normals = oracle.parting(float_axes(*values[3:5]), half, VOXEL_M)
+    depth = np.min([(reach - abs(gap @ np.array(n))) / shrinks for n, reach, shrinks in normals], axis=0)
+    depth = np.minimum(depth, half.min())
+    assert abs(depth - 1e-4).min() > 2e-9
+    return depth > 1e-4
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_random_boxes_fill_the_voxels_that_they_reach_into(shape):
+    """Each alone in its frame; the state of the counts is handed from call to call."""
+    nx, ny, nz = shape
+    steps, latest = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
+    boxes, before = random_boxes(shape, 40, seed=3), np.zeros((nz, nx, ny), np.int64)
+    for frame, values in enumerate(boxes):
+        occupancy.count_boxes(np.array([frame]), values[None], np.array(shape), VOXEL_M, steps, latest)
+        counts = np.cumsum(steps, axis=0)
+        assert not counts[-1].any()
+        assert np.array_equal((counts[:-1] - before).transpose(1, 2, 0), is_occupied(values, shape)), values
+        before = counts[:-1]
+    occupancy.sum_layers(steps)
+    assert np.array_equal(steps[:-1], before)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_overlapping_boxes_of_a_frame_count_once(shape):
+    nx, ny, nz = shape
+    steps, latest = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
+    boxes, frames = random_boxes(shape, 48, seed=4), np.repeat([0, 1, 5, 6], [20, 4, 12, 12])
+    expected = np.zeros(shape, np.int64)
+    for frame in set(frames):
+        expected += np.any([is_occupied(values, shape) for values in boxes[frames == frame]], axis=0)
+    for part in (frames < 5, frames >= 5):
+        occupancy.count_boxes(frames[part], boxes[part], np.array(shape), VOXEL_M, steps, latest)
+    assert expected.max() >= 3
+    assert np.array_equal(np.cumsum(steps, axis=0)[:-1].transpose(1, 2, 0), expected)
+
+
+def test_random_pairs_of_box_and_voxel():
+    """Boxes whose depth in a voxel is set to a few micrometres more or less than the bound."""
+    rng, n_overlapping = np.random.default_rng(5), 0
+    for values in random_boxes((1, 1, 1), 300, seed=6):
+        middle, axes, low = values[:3], float_axes(*values[3:5]), rng.uniform(-0.2, 0.2, 3)
+        depth = oracle.depth(middle, axes, values[5:] / 2, low, VOXEL_M)
+        beyond_m = rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-8, -2)
+        half = values[5:] / 2 - depth + beyond_m  # what is left of it after 0.1 mm from each side
+        if half.min() > 1e-3:
+            n_overlapping += beyond_m > 0
+            assert occupancy.overlaps(middle, axes, half, low, VOXEL_M) == (beyond_m > 0)
+    assert n_overlapping > 50
+
+
+@pytest.mark.parametrize("shape", [(3, 3, 3), (4, 1, 2), (2, 4, 1), (1, 2, 4)])
+def test_random_triangles_agree_with_rational_clipping(shape):
+    """Large ones, small ones and slivers, some of whose corners lie on planes between voxels."""
+    rng = np.random.default_rng(7)
+    for _ in range(40):
+        triangle = rng.uniform(-0.5, 1.5, (1, 3)) * np.array(shape) * VOXEL_M
+        triangle = triangle + rng.normal(size=(3, 3)) * 10 ** rng.uniform(-3, 0)
+        if rng.random() < 0.3:
+            triangle[2] = triangle[0] + rng.random() * (triangle[1] - triangle[0]) + rng.normal(size=3) * 1e-5
+        if rng.random() < 0.3:
+            triangle = np.where(rng.random((3, 3)) < 0.5, np.rint(triangle * 8) / 8, triangle)
+        check_triangle(triangle, shape)
+
+
+def random_solids(shape, seed):
+    """Turned boxes, prisms and spheres, as corners and faces: in the grid, beside it and around it."""
+    rng = np.random.default_rng(seed)
+    for kind in range(12):
+        middle, size = rng.uniform(-0.1, 1.1, (2, 3)) * np.array(shape) * VOXEL_M
+        radius = abs(size[0]) + 0.1
+        yield (
+            box(middle - size, middle + abs(size) + 0.01, rng.uniform(-3, 3), rng.uniform(-1, 1)),
+            prism(middle[:2], radius, middle[2] - 0.4, middle[2] + 0.7, 5 + kind),
+            sphere(middle, radius, 4, 5 + kind),
+        )[kind % 3]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_winding_numbers_agree_with_solid_angles(shape):
+    """Of voxel centres and of points; the triangles of some solids face inwards, and have the sign -1."""
+    centres = (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3) + 0.5) * VOXEL_M
+    winding = np.zeros((*shape[:2], shape[2] + 1), np.int32)
+    expected, point_winding = np.zeros(len(centres)), np.full((len(centres), 12), 7)
+    for number, (corners, faces) in enumerate(random_solids(shape, seed=8)):
+        sign = (-1) ** number
+        signs, solids, triangles = np.full(len(faces), sign), np.full(len(faces), number), corners[faces]
+        occupancy.add_winding_numbers(triangles, signs, np.array(shape), VOXEL_M, winding)
+        expected_here = sign * solid_angles(centres, corners, faces)
+        expected += expected_here
+        for point, totals, turns in zip(centres[::5], point_winding, expected_here[::5], strict=False):
+            occupancy.point_winding_numbers(point, triangles, solids, signs, totals)
+            assert totals[number] == pytest.approx(7 + turns, abs=1e-6)
+    assert abs(expected).max() > 0.9
+    assert np.cumsum(winding, axis=2)[:, :, :-1].reshape(-1) == pytest.approx(expected, abs=1e-6)
+    assert not np.cumsum(winding, axis=2)[:, :, -1].any()
