@@ -132,6 +132,19 @@ def test_sweep_leaves_out_the_mast_and_names_the_faces_of_the_complete_world(min
     assert {scene.world.solids[solid][1] for solid in solids} == {"building", "ground"}
 
 
+def test_sweeps_meet_what_no_beam_towards_the_region_meets(mini: Path) -> None:
+    """Walls behind the only site, 13 m from it and further: a scan can leave them out, a sweep cannot."""
+    walls = [prism(-20 - 4 * i, -9, -18 - 4 * i, 9, 0, 5, "building", f"b{i}") for i in range(8)]
+    scene = egvs.build_scene(egvs.load(write_scene(mini, *walls, sites="before,-5,0,3\n")))
+    pose = scene.sites[0].pose
+    backwards = np.array([[-1.0, 0.0, 0.0]])
+    assert Scanner(scene).sweep_from(pose, backwards, 100.0).ends_m == pytest.approx(13.0 * backwards)
+    rows = Scanner(scene, full_sweep=True).scan_site(scene.sites[0]).rows
+    behind_m = rows.ends_m[rows.returned & (rows.ends_m[:, 0] < 0) & (rows.ends_m[:, 2] > -2.0)]
+    assert len(behind_m) > 50
+    assert behind_m[:, 0] == pytest.approx(-13.0, abs=1e-6)
+
+
 def test_rejects_sensor_inside_any_other_solid(mini: Path) -> None:
     wide = feature({"type": "Point", "coordinates": [10, 12]}, name="m1", kind="mast", height_m=5, radius_m=0.6)
     kiosk = feature({"type": "Point", "coordinates": [10, 12]}, name="m1", kind="kiosk", height_m=5, radius_m=0.2)
