@@ -81,6 +81,29 @@ def test_voxel_that_is_entered_at_a_fall_gets_the_amount_before_it():
     assert hits.sum() == 34
 
 
+@pytest.mark.parametrize(("length_m", "contacts"), [(1e-6, 0), (1.01e-6, 1)])
+def test_chord_of_a_micrometre_is_no_contact(length_m, contacts):
+    o, d, shape = np.array([2.5, 2.5, 1.5]), np.array([0.0, length_m, 0.0]), np.array(SHAPE)  # in voxels of 1 m
+    hits, times = np.zeros(shape.prod(), np.int64), traversal.crossing_buffer(shape)
+    traversal.add_stepwise(o, d, shape, 1.0, np.array([np.inf]), np.array([1]), hits, times)
+    assert hits.sum() == contacts
+    traversal.add_to_voxels(o, d, shape, 1.0, 1, hits, times)
+    assert hits.sum() == 2 * contacts
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("tiny", [1e-9, 1e-300, 5e-324])
+@pytest.mark.parametrize("along", range(3))
+def test_component_that_hardly_moves_stays_in_its_row(along, tiny, sign):
+    """From outside the grid, so that the part inside begins behind the start."""
+    o, d, shape = np.full(3, 0.5), np.full(3, sign * tiny), np.array(SHAPE)
+    o[along], d[along] = -4.0, 40.0
+    hits, times = np.zeros(shape.prod(), np.int64), traversal.crossing_buffer(shape)
+    traversal.add_to_voxels(o, d, shape, VOXEL_M, 1, hits, times)
+    row = [tuple(np.where(np.arange(3) == along, k, 0)) for k in range(SHAPE[along])]
+    assert np.flatnonzero(hits).tolist() == flat(row)
+
+
 @pytest.mark.parametrize(("gamma", "capped", "below"), [(4.0, [2, 0, 1], [3, 0, 1]), (np.inf, [0] * 3, [16, 0, 5])])
 def test_classes_of_voxels_are_summed(gamma, capped, below):
     hits = np.array([4, 0, 1, 3, 4, 9, 50], np.uint32)  # the last voxel is in no class
