@@ -165,6 +165,15 @@ def test_segments_from_anywhere_agree_with_sorted_crossings(start):
     assert listed > 0 or start > 1e17
 
 
+def test_end_that_rounding_moves_by_two_voxels():
+    """Found by a search: the last voxel is guessed so far off that more crossings than guessed must be listed."""
+    o = np.array([2.1587085536310988e16, 8201562820255005.0, 1184906604654226.8])
+    d = np.array([-2.1587085536310988e16, -8201562820255006.0, -1184906604654225.5])
+    cells, t_cells, shape = np.empty(40, np.int64), np.empty((40, 2)), np.array(SHAPE)
+    count, _, _ = traversal.list_voxels(o, d, shape, VOXEL_M, cells, t_cells, traversal.crossing_buffer(shape))
+    assert cells[:count].tolist() == flat(voxel for voxel, _, _ in sorted_crossings(o, d)) == [125, 21]
+
+
 # --- the audit --------------------------------------------------------------------------------------------------------
 
 AXES = list(itertools.permutations(range(3)))
