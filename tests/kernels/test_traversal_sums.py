@@ -104,6 +104,19 @@ def test_component_that_hardly_moves_stays_in_its_row(along, tiny, sign):
     assert np.flatnonzero(hits).tolist() == flat(row)
 
 
+@pytest.mark.parametrize("along", range(3))
+@pytest.mark.parametrize("length", [-1.0, 1.0])
+def test_segments_of_one_voxel_across_the_borders(along, length):
+    d, shape = np.zeros(3), np.array(SHAPE)
+    d[along] = length
+    for start in (-0.75, 0.25, SHAPE[along] - 0.25, SHAPE[along] + 0.75):
+        o = np.full(3, 0.5)
+        o[along] = start
+        hits = np.zeros(shape.prod(), np.int64)
+        traversal.add_to_voxels(o, d, shape, VOXEL_M, 1, hits, traversal.crossing_buffer(shape))
+        assert np.flatnonzero(hits).tolist() == sorted(flat(oracle.crossed(o, d, SHAPE, VOXEL_M)))
+
+
 @pytest.mark.parametrize(("gamma", "capped", "below"), [(4.0, [2, 0, 1], [3, 0, 1]), (np.inf, [0] * 3, [16, 0, 5])])
 def test_classes_of_voxels_are_summed(gamma, capped, below):
     hits = np.array([4, 0, 1, 3, 4, 9, 50], np.uint32)  # the last voxel is in no class
@@ -170,7 +183,9 @@ def test_end_that_rounding_moves_by_two_voxels():
     o = np.array([2.1587085536310988e16, 8201562820255005.0, 1184906604654226.8])
     d = np.array([-2.1587085536310988e16, -8201562820255006.0, -1184906604654225.5])
     cells, t_cells, shape = np.empty(40, np.int64), np.empty((40, 2)), np.array(SHAPE)
-    count, _, _ = traversal.list_voxels(o, d, shape, VOXEL_M, cells, t_cells, traversal.crossing_buffer(shape))
+    times = traversal.crossing_buffer(shape)
+    times[:3] = -1.0  # left over from another segment
+    count, _, _ = traversal.list_voxels(o, d, shape, VOXEL_M, cells, t_cells, times)
     assert cells[:count].tolist() == flat(voxel for voxel, _, _ in sorted_crossings(o, d)) == [125, 21]
 
 
@@ -207,7 +222,7 @@ def audit(axes, *lists):
     listed = [each and [(tuple(np.array(voxel)[to_grid]), *shares) for voxel, *shares in each] for each in lists]
     names = {**vars(traversal), "list_voxels": Lists(*listed)}
     audit_beams = FunctionType(traversal.audit_beams.__wrapped__.__code__, names)
-    return audit_beams(o, np.tile(d, (len(lists), 1)), shape, VOXEL_M, np.zeros(24, np.uint32))
+    return audit_beams(o, np.tile(d, (len(lists), 1)).reshape(-1, 3), shape, VOXEL_M, np.zeros(24, np.uint32))
 
 
 SOUND = [((i, 1, 0), (1 + i) / 8, (2 + i) / 8) for i in range(4)]
@@ -215,7 +230,7 @@ SOUND = [((i, 1, 0), (1 + i) / 8, (2 + i) / 8) for i in range(4)]
 
 @pytest.mark.parametrize("axes", AXES)
 def test_audit_figures(axes):
-    assert audit(axes, SOUND, SOUND, SOUND) == (0.0, 0.0, 0, 0)
+    assert audit(axes) == audit(axes, SOUND, SOUND, SOUND) == (0.0, 0.0, 0, 0)
     assert audit(axes, SOUND[1:]) == (0.0, 0.25, 0, 0), "1/8 of 2 m is missing"
     assert audit(axes, SOUND, SOUND[:1] + SOUND[2:], SOUND) == (0.0, 0.25, 0, 0)
     assert audit(axes, SOUND[:2], SOUND) == (0.0, 0.5, 0, 0)
@@ -238,3 +253,11 @@ def test_audit_allows_a_chord_outside_its_voxel_by_a_billionth_of_the_grid(axes)
         start, end = SOUND[1][1:]
         assert audit(axes, [*SOUND[:1], ((1, 1, 0), start, end + (1 + 2 * outside) / 8)])[2] == misplaced
         assert audit(axes, [((1, 1, 0), start - (1 + 2 * outside) / 8, end)])[2] == misplaced
+
+
+@pytest.mark.parametrize("shape", list(itertools.permutations((30, 3, 2))))
+def test_audit_of_beams_from_corner_to_corner(shape):
+    d, hits = np.array([shape, shape], float), np.zeros(np.prod(shape), np.uint32)
+    worst_sum, longest_gap_m, misplaced, doubled = traversal.audit_beams(np.zeros(3), d, np.array(shape), VOXEL_M, hits)
+    assert (worst_sum < 1e-12, longest_gap_m < 3e-6, misplaced, doubled) == (True, True, 0, 0)
+    assert np.count_nonzero(hits) == 30
