@@ -14,59 +14,59 @@ from egvs.kernels import occupancy
 from tests.kernels.test_occupancy_solids import box, check_triangle, prism, solid_angles, sphere
 from tests.oracles import boxes as oracle
 
-VOXEL_M = 0.25
-SHAPES = [(8, 7, 5), *itertools.permutations((9, 4, 2))]
+GRIDS = [((8, 7, 5), 0.25), *[(shape, 0.25) for shape in itertools.permutations((9, 4, 2))], ((8, 7, 5), 2.0)]
+"""Shape, and edge length of a voxel."""
 
 
-def random_boxes(shape, n, seed):
+def random_boxes(shape, voxel_m, n, seed):
     """Boxes in and beside the grid, half of them pitched, from slabs to cubes."""
     rng = np.random.default_rng(seed)
-    middles = rng.uniform(-0.3, 1.3, (n, 3)) * np.array(shape) * VOXEL_M
+    middles = rng.uniform(-0.3, 1.3, (n, 3)) * np.array(shape) * voxel_m
     angles = np.column_stack([rng.uniform(-4, 4, n), rng.uniform(-1.6, 1.6, n) * rng.integers(0, 2, n)])
-    return np.column_stack([middles, angles, 10 ** rng.uniform(-2, 0.3, (n, 3))])
+    return np.column_stack([middles, angles, 10 ** rng.uniform(-2, 0.3, (n, 3)) * 4 * voxel_m])
 
 
 def float_axes(yaw_rad, pitch_rad):
     return np.array(oracle.axes_of(math.sin(yaw_rad), math.cos(yaw_rad), math.sin(pitch_rad), math.cos(pitch_rad)))
 
 
-def is_occupied(values, shape):
+def is_occupied(values, shape, voxel_m):
     """For each voxel of a grid, by all fifteen axes: whether the box reaches deeper into it than 0.1 mm."""
-    low = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) * VOXEL_M
-    gap, half = low + VOXEL_M / 2 - values[:3], values[5:] / 2
-    normals = oracle.parting(float_axes(*values[3:5]), half, VOXEL_M)
+    low = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1) * voxel_m
+    gap, half = low + voxel_m / 2 - values[:3], values[5:] / 2
+    normals = oracle.parting(float_axes(*values[3:5]), half, voxel_m)
     depth = np.min([(reach - abs(gap @ np.array(n))) / shrinks for n, reach, shrinks in normals], axis=0)
     depth = np.minimum(depth, half.min())
     assert abs(depth - 1e-4).min() > 2e-9
     return depth > 1e-4
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_random_boxes_fill_the_voxels_that_they_reach_into(shape):
+@pytest.mark.parametrize(("shape", "voxel_m"), GRIDS)
+def test_random_boxes_fill_the_voxels_that_they_reach_into(shape, voxel_m):
     """Each alone in its frame; the state of the counts is handed from call to call."""
     nx, ny, nz = shape
     steps, latest = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
-    boxes, before = random_boxes(shape, 40, seed=3), np.zeros((nz, nx, ny), np.int64)
+    boxes, before = random_boxes(shape, voxel_m, 40, seed=3), np.zeros((nz, nx, ny), np.int64)
     for frame, values in enumerate(boxes):
-        occupancy.count_boxes(np.array([frame]), values[None], np.array(shape), VOXEL_M, steps, latest)
+        occupancy.count_boxes(np.array([frame]), values[None], np.array(shape), voxel_m, steps, latest)
         counts = np.cumsum(steps, axis=0)
         assert not counts[-1].any()
-        assert np.array_equal((counts[:-1] - before).transpose(1, 2, 0), is_occupied(values, shape)), values
+        assert np.array_equal((counts[:-1] - before).transpose(1, 2, 0), is_occupied(values, shape, voxel_m)), values
         before = counts[:-1]
     occupancy.sum_layers(steps)
     assert np.array_equal(steps[:-1], before)
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_overlapping_boxes_of_a_frame_count_once(shape):
+@pytest.mark.parametrize(("shape", "voxel_m"), GRIDS)
+def test_overlapping_boxes_of_a_frame_count_once(shape, voxel_m):
     nx, ny, nz = shape
     steps, latest = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
-    boxes, frames = random_boxes(shape, 48, seed=4), np.repeat([0, 1, 5, 6], [20, 4, 12, 12])
+    boxes, frames = random_boxes(shape, voxel_m, 48, seed=4), np.repeat([0, 1, 5, 6], [20, 4, 12, 12])
     expected = np.zeros(shape, np.int64)
     for frame in set(frames):
-        expected += np.any([is_occupied(values, shape) for values in boxes[frames == frame]], axis=0)
+        expected += np.any([is_occupied(values, shape, voxel_m) for values in boxes[frames == frame]], axis=0)
     for part in (frames < 5, frames >= 5):
-        occupancy.count_boxes(frames[part], boxes[part], np.array(shape), VOXEL_M, steps, latest)
+        occupancy.count_boxes(frames[part], boxes[part], np.array(shape), voxel_m, steps, latest)
     assert expected.max() >= 3
     assert np.array_equal(np.cumsum(steps, axis=0)[:-1].transpose(1, 2, 0), expected)
 
@@ -74,54 +74,56 @@ def test_overlapping_boxes_of_a_frame_count_once(shape):
 def test_random_pairs_of_box_and_voxel():
     """Boxes whose depth in a voxel is set to a few micrometres more or less than the bound."""
     rng, n_overlapping = np.random.default_rng(5), 0
-    for values in random_boxes((1, 1, 1), 300, seed=6):
+    for values in random_boxes((1, 1, 1), 0.25, 300, seed=6):
         middle, axes, low = values[:3], float_axes(*values[3:5]), rng.uniform(-0.2, 0.2, 3)
-        depth = oracle.depth(middle, axes, values[5:] / 2, low, VOXEL_M)
+        depth = oracle.depth(middle, axes, values[5:] / 2, low, 0.25)
         beyond_m = rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-8, -2)
         half = values[5:] / 2 - depth + beyond_m  # what is left of it after 0.1 mm from each side
         if half.min() > 1e-3:
             n_overlapping += beyond_m > 0
-            assert occupancy.overlaps(middle, axes, half, low, VOXEL_M) == (beyond_m > 0)
+            assert occupancy.overlaps(middle, axes, half, low, 0.25) == (beyond_m > 0)
     assert n_overlapping > 50
 
 
-@pytest.mark.parametrize("shape", [(3, 3, 3), (4, 1, 2), (2, 4, 1), (1, 2, 4)])
-def test_random_triangles_agree_with_rational_clipping(shape):
+@pytest.mark.parametrize(
+    ("shape", "voxel_m"), [((3, 3, 3), 0.25), ((4, 1, 2), 0.25), ((2, 4, 1), 0.25), ((1, 2, 4), 0.25), ((3, 2, 2), 2.0)]
+)
+def test_random_triangles_agree_with_rational_clipping(shape, voxel_m):
     """Large ones, small ones and slivers, some of whose corners lie on planes between voxels."""
     rng = np.random.default_rng(7)
     for _ in range(40):
-        triangle = rng.uniform(-0.5, 1.5, (1, 3)) * np.array(shape) * VOXEL_M
-        triangle = triangle + rng.normal(size=(3, 3)) * 10 ** rng.uniform(-3, 0)
+        triangle = rng.uniform(-0.5, 1.5, (1, 3)) * np.array(shape) * voxel_m
+        triangle = triangle + rng.normal(size=(3, 3)) * 10 ** rng.uniform(-3, 0) * 4 * voxel_m
         if rng.random() < 0.3:
             triangle[2] = triangle[0] + rng.random() * (triangle[1] - triangle[0]) + rng.normal(size=3) * 1e-5
         if rng.random() < 0.3:
             triangle = np.where(rng.random((3, 3)) < 0.5, np.rint(triangle * 8) / 8, triangle)
-        check_triangle(triangle, shape)
+        check_triangle(triangle, shape, voxel_m)
 
 
-def random_solids(shape, seed):
+def random_solids(shape, voxel_m, seed):
     """Turned boxes, prisms and spheres, as corners and faces: in the grid, beside it and around it."""
     rng = np.random.default_rng(seed)
     for kind in range(12):
-        middle, size = rng.uniform(-0.1, 1.1, (2, 3)) * np.array(shape) * VOXEL_M
-        radius = abs(size[0]) + 0.1
+        middle, size = rng.uniform(-0.1, 1.1, (2, 3)) * np.array(shape) * voxel_m
+        radius = abs(size[0]) + 0.4 * voxel_m
         yield (
             box(middle - size, middle + abs(size) + 0.01, rng.uniform(-3, 3), rng.uniform(-1, 1)),
-            prism(middle[:2], radius, middle[2] - 0.4, middle[2] + 0.7, 5 + kind),
+            prism(middle[:2], radius, middle[2] - 1.6 * voxel_m, middle[2] + 2.8 * voxel_m, 5 + kind),
             sphere(middle, radius, 4, 5 + kind),
         )[kind % 3]
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-def test_winding_numbers_agree_with_solid_angles(shape):
+@pytest.mark.parametrize(("shape", "voxel_m"), GRIDS)
+def test_winding_numbers_agree_with_solid_angles(shape, voxel_m):
     """Of voxel centres and of points; the triangles of some solids face inwards, and have the sign -1."""
-    centres = (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3) + 0.5) * VOXEL_M
+    centres = (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3) + 0.5) * voxel_m
     winding = np.zeros((*shape[:2], shape[2] + 1), np.int32)
     expected, point_winding = np.zeros(len(centres)), np.full((len(centres), 12), 7)
-    for number, (corners, faces) in enumerate(random_solids(shape, seed=8)):
+    for number, (corners, faces) in enumerate(random_solids(shape, voxel_m, seed=8)):
         sign = (-1) ** number
         signs, solids, triangles = np.full(len(faces), sign), np.full(len(faces), number), corners[faces]
-        occupancy.add_winding_numbers(triangles, signs, np.array(shape), VOXEL_M, winding)
+        occupancy.add_winding_numbers(triangles, signs, np.array(shape), voxel_m, winding)
         expected_here = sign * solid_angles(centres, corners, faces)
         expected += expected_here
         for point, totals, turns in zip(centres[::5], point_winding, expected_here[::5], strict=False):
