@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from egvs.kernels import occupancy
-from tests.kernels.test_occupancy_solids import box, check_triangle, prism, solid_angles, sphere
+from tests.kernels.test_occupancy_solids import box, prism, reaches, solid_angles, sphere, touched, winding
 from tests.oracles import boxes as oracle
 
 GRIDS = [((8, 7, 5), 0.25), *[(shape, 0.25) for shape in itertools.permutations((9, 4, 2))], ((8, 7, 5), 2.0)]
@@ -98,7 +98,12 @@ def test_random_triangles_agree_with_rational_clipping(shape, voxel_m):
             triangle[2] = triangle[0] + rng.random() * (triangle[1] - triangle[0]) + rng.normal(size=3) * 1e-5
         if rng.random() < 0.3:
             triangle = np.where(rng.random((3, 3)) < 0.5, np.rint(triangle * 8) / 8, triangle)
-        check_triangle(triangle, shape, voxel_m)
+        filled = touched(triangle, shape, voxel_m)
+        for cell in itertools.product(*map(range, shape)):
+            exact, centre = reaches(triangle, cell, voxel_m), (np.array(cell) + 0.5) * voxel_m
+            if exact is not None:
+                assert filled[cell] == exact
+                assert occupancy.triangle_intersects_cube(triangle, centre, voxel_m / 2 - 1e-4) == exact
 
 
 def random_solids(shape, voxel_m, seed):
@@ -118,17 +123,23 @@ def random_solids(shape, voxel_m, seed):
 def test_winding_numbers_agree_with_solid_angles(shape, voxel_m):
     """Of voxel centres and of points; the triangles of some solids face inwards, and have the sign -1."""
     centres = (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3) + 0.5) * voxel_m
-    winding = np.zeros((*shape[:2], shape[2] + 1), np.int32)
+    turns = np.zeros((*shape[:2], shape[2] + 1), np.int32)
     expected, point_winding = np.zeros(len(centres)), np.full((len(centres), 12), 7)
     for number, (corners, faces) in enumerate(random_solids(shape, voxel_m, seed=8)):
         sign = (-1) ** number
         signs, solids, triangles = np.full(len(faces), sign), np.full(len(faces), number), corners[faces]
-        occupancy.add_winding_numbers(triangles, signs, np.array(shape), voxel_m, winding)
+        occupancy.add_winding_numbers(triangles, signs, np.array(shape), voxel_m, turns)
         expected_here = sign * solid_angles(centres, corners, faces)
         expected += expected_here
-        for point, totals, turns in zip(centres[::5], point_winding, expected_here[::5], strict=False):
+        for point, totals, expected_turns in zip(centres[::5], point_winding, expected_here[::5], strict=False):
             occupancy.point_winding_numbers(point, triangles, solids, signs, totals)
-            assert totals[number] == pytest.approx(7 + turns, abs=1e-6)
+            assert totals[number] == pytest.approx(7 + expected_turns, abs=1e-6)
     assert abs(expected).max() > 0.9
-    assert np.cumsum(winding, axis=2)[:, :, :-1].reshape(-1) == pytest.approx(expected, abs=1e-6)
-    assert not np.cumsum(winding, axis=2)[:, :, -1].any()
+    assert np.cumsum(turns, axis=2)[:, :, :-1].reshape(-1) == pytest.approx(expected, abs=1e-6)
+    assert not np.cumsum(turns, axis=2)[:, :, -1].any()
+
+
+def test_point_on_the_floor_is_inside_and_on_the_roof_outside():
+    corners, faces = box((0.0, 0.0, 1.0), (4.0, 3.0, 2.0))
+    turns = [winding((1.1, 1.7, z), corners, faces) for z in (0.9, 1.0, 1.9, 2.0, 2.1)]
+    assert [abs(n) for n in turns] == [0, 1, 1, 0, 0]
