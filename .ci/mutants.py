@@ -1,14 +1,15 @@
 """Change the code in one place at a time, and list the changes that no test notices.
 
-usage: python .ci/mutants.py [--sample N] [--seed S] [--jobs N] [MODULE_OR_PACKAGE...]
+usage: python .ci/mutants.py [--sample N] [--seed S] [--jobs N] [--explained] [MODULE_OR_PACKAGE...]
 
 A mutant is one changed operator, number, condition or loop, made by Cosmic Ray. Without arguments all mutants of the
 formula modules are tried; otherwise those of modules or packages, such as `kernels/occupancy` or `scoring`. Each is
-tried on the tests of its module, then on the fast ones of its package, in a process that is forked after the libraries
-were imported. A mutant of a kernel is not compiled: that would take longer than the tests. A test that takes more than
-ten seconds without a mutant, or fails without compiled kernels, is left out. A mutant is killed if a test fails or
-hangs. The others are printed as survivors, but for those in `.ci/equivalent_mutants.txt`, which says why they compute
-the same.
+tried on the tests of its module, then on the fast ones of its package, in a process that is forked once the tests are
+collected; there, its code replaces the module's. Short tests come first, since most mutants fail one. A mutant of a
+kernel is not compiled: that would take longer than the tests. A test that takes more than ten seconds without a mutant,
+or fails without compiled kernels, is left out. A mutant is killed if a test fails or hangs. The others survive; they
+are printed after each group of tests, and as they are found appended to `build/mutants/passing.txt`.
+`.ci/equivalent_mutants.txt` says which mutants compute the same, and why; they are tried only with `--explained`.
 """
 
 from __future__ import annotations
@@ -16,26 +17,28 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib
-import importlib.machinery
+import itertools
 import json
 import os
 import random
 import signal
 import sys
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache, lru_cache
 from pathlib import Path
-from types import CodeType, ModuleType
 
 import numba
 import pytest
+from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE = ROOT / "pipeline" / "egvs"
+BUILD = ROOT / "build" / "mutants"
+UNCHANGED, PASSING = BUILD / "unchanged.json", BUILD / "passing.txt"
 FORMULA_MODULES = ("scoring/egvs", "kernels/traversal", "kernels/occupancy", "sensors/scanner")
 OPERATORS = (
     *(f"ReplaceBinaryOperator_{pair}" for pair in (
@@ -53,15 +56,16 @@ OPERATORS = (
 PYTEST = ("-q", "-n", "0", "-p", "no:cacheprovider", "--no-header", "--tb=no")
 # Python's integers and NumPy's numbers warn where compiled code wraps around or divides by zero as IEEE 754 says.
 PYTEST += tuple(f"-Wignore:{start}:RuntimeWarning" for start in ("overflow", "divide by zero", "invalid value"))
-LIBRARIES = ("numpy", "scipy", "shapely", "numba", "pyarrow", "trimesh", "pydantic")
 USERS = {"sensors/scanner": ("effects", "clouds")}
 """Other packages whose tests say what a module must do."""
 FAST, SLOW = "not slow and not nightly", "slow and not nightly"
 PASSED = (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
 LONGEST_TEST_S = 10.0
 SLOWER = 5.0
-LEAST_LIMIT_S = 5.0
-"""A test with a mutant may take this and five times its usual time; else it hangs, and the mutant is killed."""
+LEAST_LIMIT_S = 2.0
+"""A test with a mutant may take this and five times its usual processor time; else it hangs: the mutant is killed."""
+LONGEST_WAIT_S = 60.0
+"""A test may take this and five times its usual processor time by the clock, too: it may wait for another process."""
 
 
 @dataclass(frozen=True)
@@ -78,25 +82,37 @@ class Mutant:
         return f"{self.module}: {self.change}"
 
 
-def list_mutants(module: str) -> Iterator[Mutant]:
-    """Yield the mutants of a module that may compute something else."""
-    source = (SOURCE / f"{module}.py").read_text(encoding="utf-8")
-    same = _meaning(source)
-    lines = source.splitlines()
+def list_changes(module: str) -> list[tuple[str, str, int]]:
+    """Return the module, the operator and the occurrence of each change that may be a mutant."""
+    nodes = list(ast_nodes(get_ast(_source(module))))
+    changes = []
     for name in OPERATORS:
         operator = get_operator(f"core/{name}")()
-        for occurrence in range(len(source)):
-            code = mutate_code(source, operator, occurrence)
-            if code is None:
-                break
-            with suppress(SyntaxError):
-                if _meaning(code) == same:
-                    continue
-                after = code.splitlines()
-                line = next(n for n, pair in enumerate(zip(lines, after, strict=False)) if pair[0] != pair[1])
-                yield Mutant(module, code, line + 1, f"{lines[line].strip()} -> {after[line].strip()}")
+        count = sum(len(list(operator.mutation_positions(node))) for node in nodes)
+        changes += [(module, name, occurrence) for occurrence in range(count)]
+    return changes
 
 
+def make_mutant(module: str, name: str, occurrence: int) -> Mutant | None:
+    """Return the mutant of a change; None if it is no Python, or cannot compute anything else."""
+    source = _source(module)
+    code = mutate_code(source, get_operator(f"core/{name}")(), occurrence)
+    try:
+        if code is None or _meaning(code) == _meaning(source):
+            return None
+    except SyntaxError:
+        return None
+    pairs = zip(source.splitlines(), code.splitlines(), strict=False)
+    line, (before, after) = next((n, pair) for n, pair in enumerate(pairs, start=1) if pair[0] != pair[1])
+    return Mutant(module, code, line, f"{before.strip()} -> {after.strip()}")
+
+
+@cache
+def _source(module: str) -> str:
+    return (SOURCE / f"{module}.py").read_text(encoding="utf-8")
+
+
+@lru_cache(maxsize=2)
 def _meaning(source: str) -> str:
     """Return the syntax tree without annotations and decorators, which say nothing where kernels are not compiled."""
     tree = ast.parse(source)
@@ -108,75 +124,94 @@ def _meaning(source: str) -> str:
     return ast.dump(tree)
 
 
-class _Loader(importlib.machinery.SourceFileLoader):
-    """Imports a module with other code."""
-
-    def __init__(self, name: str, path: str, code: str) -> None:
-        super().__init__(name, path)
-        self._code = code
-
-    def get_code(self, fullname: str) -> CodeType:
-        return compile(self._code, self.path, "exec")
-
-
-class _Finder:
-    """Finds a module before Python does."""
-
-    def __init__(self, module: str, code: str) -> None:
-        self._name = f"egvs.{module.replace('/', '.')}"
-        self._loader = _Loader(self._name, str(SOURCE / f"{module}.py"), code)
-
-    def find_spec(
-        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
-    ) -> importlib.machinery.ModuleSpec | None:
-        if name != self._name:
-            return None
-        spec = importlib.machinery.ModuleSpec(name, self._loader, origin=self._loader.path)
-        spec.has_location = True
-        return spec
+def replace_code(module: str, code: str) -> None:
+    """Replace the code of an imported module, and what other modules imported from it."""
+    changed = importlib.import_module(f"egvs.{module.replace('/', '.')}")
+    before = dict(vars(changed))
+    exec(compile(code, str(SOURCE / f"{module}.py"), "exec"), vars(changed))
+    for other in list(sys.modules.values()):
+        for name, value in list(getattr(other, "__dict__", {}).items()):
+            if name in before and value is before[name] and not name.startswith("__"):
+                setattr(other, name, vars(changed)[name])
 
 
-class _Watch:
-    """A plugin of pytest that records how long tests take and which fail, and ends the process when one hangs."""
+class _Tests:
+    """A plugin of pytest: short tests first; how long each takes and which fail."""
 
     def __init__(self, usual_s: Mapping[str, float]) -> None:
-        self.seconds: dict[str, float] = defaultdict(float)
+        self.seconds: dict[str, float] = {}
         self.failed: set[str] = set()
         self._usual_s = usual_s
 
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items.sort(key=lambda item: self._usual_s.get(item.nodeid, 0.0))
+
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        if nodeid in self._usual_s:
-            signal.setitimer(signal.ITIMER_REAL, LEAST_LIMIT_S + SLOWER * self._usual_s[nodeid])
+        self.seconds[nodeid] = -_processor_s()
+
+    def pytest_runtest_logfinish(self, nodeid: str) -> None:
+        self.seconds[nodeid] += _processor_s()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self.seconds[report.nodeid] += report.duration
         if report.failed:
             self.failed.add(report.nodeid)
 
 
-def fork_tests(
-    module: str, options: Sequence[str], usual_s: Mapping[str, float], code: str | None, record: Path | None = None
-) -> int:
-    """Start tests in a process of its own, with a module's code replaced; return the process.
+def _processor_s() -> float:
+    """Return the processor time of this process and of those that it waited for."""
+    return sum(os.times()[:4])
 
-    Its exit code is 0 if all pass. A test may take some times as long as usual. ``record`` receives the seconds of each
-    test, the failed ones, and the imported modules.
-    """
+
+class _Trials(_Tests):
+    """Forks a process for each mutant once the tests are collected; that process runs them until one fails or hangs."""
+
+    def __init__(self, mutants: Sequence[Mutant], usual_s: Mapping[str, float], jobs: int) -> None:
+        super().__init__(usual_s)
+        self._mutants = mutants
+        self._jobs = jobs
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_finish(self) -> None:
+        waiting, running = list(range(len(self._mutants)))[::-1], {}
+        while waiting or running:
+            if waiting and len(running) < self._jobs:
+                number = waiting.pop()
+                if not (process := os.fork()):
+                    os.setsid()
+                    replace_code(self._mutants[number].module, self._mutants[number].code)
+                    return
+                running[process] = number
+                continue
+            process, status = os.wait()
+            with suppress(ProcessLookupError):
+                os.killpg(process, signal.SIGKILL)
+            number = running.pop(process)
+            if os.waitstatus_to_exitcode(status) in PASSED:
+                with PASSING.open("a", encoding="utf-8") as file:
+                    file.write(f"{number} {self._mutants[number]}\n")
+        os._exit(0)
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        super().pytest_runtest_logstart(nodeid)
+        longest_s = SLOWER * self._usual_s[nodeid]
+        signal.setitimer(signal.ITIMER_PROF, LEAST_LIMIT_S + longest_s)
+        signal.setitimer(signal.ITIMER_REAL, LONGEST_WAIT_S + longest_s)
+
+
+def run_tests(module: str, options: Sequence[str], plugin: _Tests) -> int:
+    """Run tests of a module in a process of its own, and return its exit code; kernels are tested uncompiled."""
     if process := os.fork():
-        return process
-    os.setsid()
+        _, status = os.waitpid(process, 0)
+        return os.waitstatus_to_exitcode(status)
     null = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(null, stream)
     if module.startswith("kernels/"):
         numba.config.DISABLE_JIT = True
-    if code is not None:
-        sys.meta_path.insert(0, _Finder(module, code))
-    watch = _Watch(usual_s)
-    ended = int(pytest.main([*PYTEST, *options], plugins=[watch]))
-    if record is not None:
-        seen = {"seconds": watch.seconds, "failed": sorted(watch.failed), "modules": list(sys.modules)}
-        record.write_text(json.dumps(seen), encoding="utf-8")
+    ended = int(pytest.main([*PYTEST, *options], plugins=[plugin]))
+    if not isinstance(plugin, _Trials):
+        UNCHANGED.write_text(json.dumps([plugin.seconds, sorted(plugin.failed)]), encoding="utf-8")
     os._exit(ended)
 
 
@@ -190,52 +225,43 @@ def own_and_other_tests(module: str) -> list[list[str]]:
     return [[str(file.relative_to(ROOT)) for file in part] for part in parts]
 
 
-def try_unchanged(module: str, options: Sequence[str], build: Path) -> tuple[list[str], dict[str, float]]:
+def try_unchanged(module: str, options: Sequence[str]) -> tuple[list[str], dict[str, float]]:
     """Run tests without a mutant; return the options that leave out what fails or takes long, and seconds by test.
 
-    They are run twice: the first time to learn which libraries they import, which are then imported here.
+    They are run twice: a fixture of several tests takes its time in the first of them, and the order is set by time.
     """
-    record = build / "unchanged.json"
-    record.unlink(missing_ok=True)
+    usual_s: dict[str, float] = {}
     for _ in range(2):
-        os.waitpid(fork_tests(module, options, {}, None, record), 0)
-        seen = json.loads(record.read_text(encoding="utf-8"))
-        for name in seen["modules"]:
-            if name.split(".")[0] in LIBRARIES:
-                with suppress(Exception):  # what cannot be imported alone is imported by the tests
-                    importlib.import_module(name)
-    long = (name for name, seconds in seen["seconds"].items() if seconds > LONGEST_TEST_S)
-    wanted = [*options, *(f"--deselect={name}" for name in {*seen["failed"], *long})]
-    same = (SOURCE / f"{module}.py").read_text(encoding="utf-8")
-    _, status = os.waitpid(fork_tests(module, [*wanted, "-x"], seen["seconds"], same), 0)
-    if (code := os.waitstatus_to_exitcode(status)) not in PASSED:
-        raise SystemExit(f"{module}: without a change the tests end with {code}, so they tell nothing of changes")
-    return wanted, seen["seconds"]
+        UNCHANGED.unlink(missing_ok=True)
+        code = run_tests(module, options, _Tests(usual_s))
+        if code not in (*PASSED, pytest.ExitCode.TESTS_FAILED):
+            raise SystemExit(f"{module}: without a change the tests end with {code}")
+        usual_s, failed = json.loads(UNCHANGED.read_text(encoding="utf-8"))
+    long = [name for name, seconds in usual_s.items() if seconds > LONGEST_TEST_S]
+    return [*options, *(f"--deselect={name}" for name in {*failed, *long})], usual_s
 
 
-def survivors(module: str, mutants: Sequence[Mutant], build: Path, jobs: int) -> list[Mutant]:
+def survivors(module: str, mutants: Sequence[Mutant], jobs: int) -> list[Mutant]:
     """Return the mutants of a module with which all tests pass."""
+    unchanged = Mutant(module, _source(module), 0, "unchanged")
     alive = list(mutants)
     own, others = own_and_other_tests(module)
     for marks, files in ((FAST, own), (SLOW, own), (FAST, others)):
         if not alive or not files:
             continue
-        options, usual_s = try_unchanged(module, ["-m", marks, *files], build)
+        options, usual_s = try_unchanged(module, ["-m", marks, *files])
         left_out = sum(option.startswith("--deselect") for option in options)
         print(f"  {module}, {marks}: {len(alive)} mutants, {len(usual_s)} tests, {left_out} left out", flush=True)
-        waiting, alive = alive[::-1], []
-        running: dict[int, Mutant] = {}
-        while waiting or running:
-            while waiting and len(running) < jobs:
-                mutant = waiting.pop()
-                running[fork_tests(module, [*options, "-x"], usual_s, mutant.code)] = mutant
-            process, status = os.wait()
-            if os.waitstatus_to_exitcode(status) in PASSED:
-                alive.append(running[process])
-                print(f"    passes: {running[process].line}: {running[process].change}", flush=True)
-            del running[process]
-            with suppress(ProcessLookupError):
-                os.killpg(process, signal.SIGKILL)
+        tried = [unchanged, *alive]
+        PASSING.write_text("", encoding="utf-8")
+        if code := run_tests(module, [*options, "-x"], _Trials(tried, usual_s, jobs)):
+            raise SystemExit(f"{module}: the trials end with {code}, before all mutants were tried")
+        passing = {int(line.split(" ")[0]) for line in PASSING.read_text(encoding="utf-8").splitlines()}
+        if 0 not in passing:
+            raise SystemExit(f"{module}: a test fails without a change, so they tell nothing of changes")
+        alive = [mutant for number, mutant in enumerate(tried) if number in passing and mutant is not unchanged]
+        for mutant in alive:
+            print(f"    passes: {mutant.line}: {mutant.change}", flush=True)
     return alive
 
 
@@ -246,25 +272,28 @@ def main() -> int:
     parser.add_argument("--sample", type=int, help="so many mutants, drawn at random; all by default")
     parser.add_argument("--seed", type=int, default=20261128)
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--explained", action="store_true", help="try those of equivalent_mutants.txt, too")
     options = parser.parse_args()
-    build = ROOT / "build" / "mutants"
-    build.mkdir(parents=True, exist_ok=True)
+    BUILD.mkdir(parents=True, exist_ok=True)
     os.chdir(ROOT)
     explained = (ROOT / ".ci" / "equivalent_mutants.txt").read_text(encoding="utf-8").splitlines()
     unexplained = 0
     for name in options.names:
         package = SOURCE / name
         files = sorted(package.glob("[!_]*.py")) if package.is_dir() else [package.with_suffix(".py")]
-        mutants = [m for file in files for m in list_mutants(str(file.relative_to(SOURCE).with_suffix("")))]
+        changes = [c for file in files for c in list_changes(str(file.relative_to(SOURCE).with_suffix("")))]
         if options.sample is not None:
-            mutants = random.Random(options.seed).sample(mutants, options.sample)
-        alive: list[Mutant] = []
-        for module in dict.fromkeys(mutant.module for mutant in mutants):
-            alive += survivors(module, [mutant for mutant in mutants if mutant.module == module], build, options.jobs)
-        killed = len(mutants) - len(alive)
+            random.Random(options.seed).shuffle(changes)
+        mutants = list(itertools.islice(filter(None, itertools.starmap(make_mutant, changes)), options.sample))
+        tried = [mutant for mutant in mutants if options.explained or str(mutant) not in explained]
+        alive = []
+        for module in dict.fromkeys(mutant.module for mutant in tried):
+            alive += survivors(module, [mutant for mutant in tried if mutant.module == module], options.jobs)
         unknown = [mutant for mutant in alive if str(mutant) not in explained]
         unexplained += len(unknown)
-        share = f"{killed} of {len(mutants)} mutants killed, {len(alive) - len(unknown)} equivalent"
+        equivalent = len(mutants) - len(tried) + len(alive) - len(unknown)
+        killed = len(tried) - len(alive)
+        share = f"{killed} of {len(mutants)} mutants killed, {equivalent} equivalent"
         print(f"{name}: {share}, {len(unknown)} survive")
         for mutant in unknown:
             print(f"  {mutant.module}.py:{mutant.line}: {mutant.change}", flush=True)
