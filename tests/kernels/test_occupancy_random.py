@@ -23,6 +23,7 @@ def random_boxes(shape, voxel_m, n, seed):
     rng = np.random.default_rng(seed)
     middles = rng.uniform(-0.3, 1.3, (n, 3)) * np.array(shape) * voxel_m
     angles = np.column_stack([rng.uniform(-4, 4, n), rng.uniform(-1.6, 1.6, n) * rng.integers(0, 2, n)])
+    angles[::15, 1] = rng.choice([-1.0, 1.0])
     return np.column_stack([middles, angles, 10 ** rng.uniform(-2, 0.3, (n, 3)) * 4 * voxel_m])
 
 
@@ -46,7 +47,7 @@ def test_random_boxes_fill_the_voxels_that_they_reach_into(shape, voxel_m):
     """Each alone in its frame; the state of the counts is handed from call to call."""
     nx, ny, nz = shape
     steps, latest = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
-    boxes, before = random_boxes(shape, voxel_m, 40, seed=3), np.zeros((nz, nx, ny), np.int64)
+    boxes, before = random_boxes(shape, voxel_m, 90, seed=3), np.zeros((nz, nx, ny), np.int64)
     for frame, values in enumerate(boxes):
         occupancy.count_boxes(np.array([frame]), values[None], np.array(shape), voxel_m, steps, latest)
         counts = np.cumsum(steps, axis=0)
@@ -71,10 +72,39 @@ def test_overlapping_boxes_of_a_frame_count_once(shape, voxel_m):
     assert np.array_equal(np.cumsum(steps, axis=0)[:-1].transpose(1, 2, 0), expected)
 
 
+def count_layers(frames, layers, n_layers, n_columns=64):
+    """Counts of frames, (columns, layers), of boxes of one voxel by so many columns, from a layer up to another."""
+    boxes = [[0.5, n_columns / 2, (a + b) / 2, 0.0, 0.0, 1.0, n_columns, b - a] for a, b in layers]
+    steps, latest = np.zeros((n_layers + 1, 1, n_columns), np.int32), np.full((3, 1, n_columns), -1, np.int64)
+    occupancy.count_boxes(np.array(frames), np.array(boxes), np.array([1, n_columns, n_layers]), 1.0, steps, latest)
+    occupancy.sum_layers(steps)
+    return steps[:-1, 0].T
+
+
+def test_boxes_above_one_another_count_once_in_each_frame():
+    """Two intervals a column, whose 64 columns just fit into the scratch memory; three frames alike; a frame apart."""
+    assert count_layers([0, 0], [(0, 1), (2, 3)], 4).tolist() == [[1, 0, 1, 0]] * 64
+    assert count_layers([0, 0, 1, 1, 7, 7], [(0, 1), (2, 3)] * 3, 4).tolist() == [[3, 0, 3, 0]] * 64
+    assert count_layers([3, 3, 4], [(0, 1), (2, 3), (2, 4)], 4).tolist() == [[1, 0, 2, 1]] * 64
+
+
+def test_grown_scratch_memory_keeps_its_intervals():
+    """A box through all layers adds only what none of 100 boxes in every second layer has occupied."""
+    apart = [(2 * n, 2 * n + 1) for n in np.random.default_rng(9).permutation(100).tolist()]
+    counts = count_layers([0] * 101, [*apart, (0, 200)], 200, n_columns=3)
+    assert counts.tolist() == [[1] * 200] * 3
+
+
+def test_weights_are_added_to_the_hits_of_cells():
+    hits = np.array([10, 20, 30, 40])
+    occupancy.accumulate(np.array([3, 0, 3]), np.array([1, 2, 5]), hits)
+    assert hits.tolist() == [12, 20, 30, 46]
+
+
 def test_random_pairs_of_box_and_voxel():
     """Boxes whose depth in a voxel is set to a few micrometres more or less than the bound."""
     rng, n_overlapping = np.random.default_rng(5), 0
-    for values in random_boxes((1, 1, 1), 0.25, 300, seed=6):
+    for values in random_boxes((1, 1, 1), 0.25, 1200, seed=6):
         middle, axes, low = values[:3], float_axes(*values[3:5]), rng.uniform(-0.2, 0.2, 3)
         depth = oracle.depth(middle, axes, values[5:] / 2, low, 0.25)
         beyond_m = rng.choice([-1.0, 1.0]) * 10 ** rng.uniform(-8, -2)
