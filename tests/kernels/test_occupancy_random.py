@@ -23,7 +23,7 @@ def random_boxes(shape, voxel_m, n, seed):
     rng = np.random.default_rng(seed)
     middles = rng.uniform(-0.3, 1.3, (n, 3)) * np.array(shape) * voxel_m
     angles = np.column_stack([rng.uniform(-4, 4, n), rng.uniform(-1.6, 1.6, n) * rng.integers(0, 2, n)])
-    angles[::15, 1] = rng.choice([-1.0, 1.0])
+    angles[::15, 1], angles[7::15, 1] = 1.0, -1.0
     return np.column_stack([middles, angles, 10 ** rng.uniform(-2, 0.3, (n, 3)) * 4 * voxel_m])
 
 
