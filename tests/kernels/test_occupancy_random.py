@@ -173,3 +173,13 @@ def test_point_on_the_floor_is_inside_and_on_the_roof_outside():
     corners, faces = box((0.0, 0.0, 1.0), (4.0, 3.0, 2.0))
     turns = [winding((1.1, 1.7, z), corners, faces) for z in (0.9, 1.0, 1.9, 2.0, 2.1)]
     assert [abs(n) for n in turns] == [0, 1, 1, 0, 0]
+
+
+def test_smallest_triangles_of_the_lattice():
+    """Twice the areas of the three parts about the point (0, 1) are 1, the least; a smaller triangle is none."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [-1, 3, 0]]) * occupancy.SNAP_M + [0.0, 0.0, 6.0]
+    corners[2, 2] = 9.0
+    assert occupancy.vertical_crossing(corners, 0.0, occupancy.SNAP_M) == (1, 7.0)
+    assert occupancy.vertical_crossing(corners[::-1], 0.0, occupancy.SNAP_M) == (-1, 7.0)
+    assert occupancy.vertical_crossing(corners, 0.0, 3 * occupancy.SNAP_M) == (0, 0.0)
+    assert occupancy.vertical_crossing(corners * 1e-3, 0.0, 0.0) == (0, 0.0)
