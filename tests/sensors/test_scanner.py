@@ -78,6 +78,16 @@ def test_scan_shares_no_data_with_the_scanner(scene):
     assert np.array_equal(scanner.scan(scene.sites[0].pose, sensor).rows.ends_m, remaining)
 
 
+def test_record_of_a_scan_names_the_site_where_it_has_no_pole(scene):
+    scan = Scanner(scene).scan(scene.sites[0].pose, scene.sensor("small"))
+    assert [scan.as_site("s").pole, scan.as_site("s", "p").pole] == ["s", "p"]
+
+
+def test_options_of_a_scanner_are_named(scene):
+    with pytest.raises(TypeError, match="positional"):
+        Scanner(scene, True)
+
+
 def test_threads_may_share_a_scanner(scene):
     scanner, sensor = Scanner(scene), scene.sensor("small")
     poses = [Pose(5.0 + i, 14.0, 3.0, yaw_deg=3.0 * i) for i in range(24)]
@@ -372,6 +382,7 @@ def test_measured_points_count_where_their_beams_can_meet_the_region(mini: Path)
     meets = [((low <= p) & (p <= high)).all(axis=1).any() for p in pose.position_m + directions[:, None] * steps]
     difference = set(scan.rows.beam.tolist()) ^ set(np.flatnonzero(meets).tolist())
     assert 10 < sum(meets) < 200
+    assert scan.rows.weight is None, "nothing in the scenario weights beams"
     assert len(difference) <= 1, "beams that graze an edge between two samples"
 
 
