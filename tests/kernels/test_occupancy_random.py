@@ -183,3 +183,33 @@ def test_smallest_triangles_of_the_lattice():
     assert occupancy.vertical_crossing(corners[::-1], 0.0, occupancy.SNAP_M) == (-1, 7.0)
     assert occupancy.vertical_crossing(corners, 0.0, 3 * occupancy.SNAP_M) == (0, 0.0)
     assert occupancy.vertical_crossing(corners * 1e-3, 0.0, 0.0) == (0, 0.0)
+
+
+def test_sides_are_decided_from_61_micrometres_on():
+    """The lattice moves a point and a side by half of that each."""
+    for at in np.random.default_rng(10).uniform(0.0, 5.0, 200):
+        corners = np.array([[at, -1.0, 2.0], [at + 4.0, -1.0, 2.0], [at, 7.0, 2.0]])
+        assert [occupancy.vertical_crossing(corners, at + x, 0.3)[0] for x in (-6.2e-5, 6.2e-5)] == [0, 1]
+
+
+def test_solids_of_100_km_fit_into_64_bits():
+    corners = np.array([[0.0, 0.0, 5.0], [1e5, 0.0, 5.0], [0.0, 1e5, 5.0]])
+    assert occupancy.vertical_crossing(corners, 3e4, 4e4) == (1, pytest.approx(5.0))
+    assert occupancy.vertical_crossing(corners, 6e4, 5e4) == (0, 0.0)
+
+
+@pytest.mark.parametrize("pitch", [0.0, 1e-12])
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("move_m", [-1e-4, 1e-4])
+def test_side_on_the_bound_is_no_contact(axis, move_m, pitch):
+    """0.1 mm behind a plane to the last digit, whichever binary numbers those decimals are."""
+    for cell in range(1, 5):
+        steps, latest = np.zeros((8, 7, 7), np.int32), np.full((3, 7, 7), -1, np.int64)
+        values = np.array([[0.3, 0.3, 0.3, 0.0, pitch, 0.2, 0.2, 0.2]])
+        values[0, axis] = (2 * cell + 2) / 20 + move_m
+        occupancy.count_boxes(np.array([0]), values, np.full(3, 7), 0.1, steps, latest)
+        expected = np.zeros((7, 7, 7), bool)
+        inside = [slice(2, 4)] * 3
+        inside[axis] = slice(cell, cell + 2)
+        expected[tuple(inside)] = True
+        assert np.array_equal(np.cumsum(steps, axis=0)[:-1].transpose(1, 2, 0), expected)
