@@ -1,6 +1,6 @@
 """Change the code in one place at a time, and list the changes that no test notices.
 
-usage: python .ci/mutants.py [--sample N] [--seed S] [--jobs N] [--explained] [MODULE_OR_PACKAGE...]
+usage: python .ci/mutants.py [--sample N] [--seed S] [--jobs N] [--skip-explained] [MODULE_OR_PACKAGE...]
 
 A mutant is one changed operator, number, condition or loop, made by Cosmic Ray. Without arguments all mutants of the
 formula modules are tried; otherwise those of modules or packages, such as `kernels/occupancy` or `scoring`. Each is
@@ -9,7 +9,8 @@ collected; there, its code replaces the module's. Short tests come first, since 
 kernel is not compiled: that would take longer than the tests. A test that takes more than ten seconds without a mutant,
 or fails without compiled kernels, is left out. A mutant is killed if a test fails or hangs. The others survive; they
 are printed after each group of tests, and as they are found appended to `build/mutants/passing.txt`.
-`.ci/equivalent_mutants.txt` says which mutants compute the same, and why; they are tried only with `--explained`.
+`.ci/equivalent_mutants.txt` says which mutants compute the same, and why. With `--skip-explained` these are not tried,
+nor any other mutant of the module that reads the same.
 """
 
 from __future__ import annotations
@@ -272,7 +273,7 @@ def main() -> int:
     parser.add_argument("--sample", type=int, help="so many mutants, drawn at random; all by default")
     parser.add_argument("--seed", type=int, default=20261128)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--explained", action="store_true", help="try those of equivalent_mutants.txt, too")
+    parser.add_argument("--skip-explained", action="store_true", help="do not try those of equivalent_mutants.txt")
     options = parser.parse_args()
     BUILD.mkdir(parents=True, exist_ok=True)
     os.chdir(ROOT)
@@ -285,7 +286,7 @@ def main() -> int:
         if options.sample is not None:
             random.Random(options.seed).shuffle(changes)
         mutants = list(itertools.islice(filter(None, itertools.starmap(make_mutant, changes)), options.sample))
-        tried = [mutant for mutant in mutants if options.explained or str(mutant) not in explained]
+        tried = [mutant for mutant in mutants if not options.skip_explained or str(mutant) not in explained]
         alive = []
         for module in dict.fromkeys(mutant.module for mutant in tried):
             alive += survivors(module, [mutant for mutant in tried if mutant.module == module], options.jobs)
