@@ -21,7 +21,7 @@ from egvs.core.grid import Roi
 from egvs.formats import point_clouds
 from egvs.formats.georeference import WorldFrame
 from egvs.kernels import embree
-from egvs.sensors.scanner import Scan, Scanner, _count_distinct
+from egvs.sensors.scanner import Scan, Scanner, _bounding_roi, _count_distinct
 from egvs.sensors.scene import Scene
 from egvs.sensors.sites import Pose
 from egvs.stages.inputs import build_scene
@@ -153,6 +153,21 @@ def test_sweeps_meet_what_no_beam_towards_the_region_meets(mini: Path) -> None:
     behind_m = rows.ends_m[rows.returned & (rows.ends_m[:, 0] < 0) & (rows.ends_m[:, 2] > -2.0)]
     assert len(behind_m) > 50
     assert behind_m[:, 0] == pytest.approx(-13.0, abs=1e-6)
+
+
+def test_box_around_a_full_sweep_holds_the_world_and_the_region(scene: Scene) -> None:
+    box = _bounding_roi(scene)
+    low_m, region_m = np.array(box.origin_m), np.array(scene.roi.origin_m)
+    held = np.concatenate([scene.world.vertices_m, [region_m, region_m + scene.roi.size_m]])
+    assert (low_m < held).all() and (held < low_m + box.size_m).all()
+
+
+@pytest.mark.parametrize(("x_m", "is_beyond"), [(1e8, False), (1.01e8, True)])
+def test_rejects_points_beyond_the_largest_coordinate(mini: Path, x_m: float, is_beyond: bool) -> None:
+    (mini / "p.csv").write_text(f"x_m,y_m,z_m\n{x_m},0,1\n")
+    with pytest.raises(InputError) as error:
+        scan_file(mini, "p.csv", crs="")
+    assert ("expected points within 1e+08 m" in str(error.value)) == is_beyond
 
 
 def test_rejects_sensor_inside_any_other_solid(mini: Path) -> None:
