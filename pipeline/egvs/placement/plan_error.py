@@ -249,6 +249,23 @@ class PlanErrors:
             return [UNKNOWN_ERROR] * len(plans)
         return self._step_errors(self._replicates.of_plans(term, ((), *plans), sites, moved=moved))
 
+    def of_change(self, term: CoverageTerm, sites: Sequence[Site], changed: FloatArray) -> StepError:
+        """Return the errors of a plan of all sites in another run of the same frames, compared with it in this one.
+
+        Parameters
+        ----------
+        term
+            The joint score in this run.
+        sites
+            The candidates of the term; they are scanned anew.
+        changed
+            The replicates of the plan in the other run, (1 + k + d,) float64 (:meth:`PlanReplicates.of_plans`).
+        """
+        if not self.are_known:
+            return UNKNOWN_ERROR
+        rows = self._replicates.of_plans(term, [range(len(sites))], sites, moved=True)
+        return self._step_errors(np.vstack([rows, changed]))[0]
+
     def of_chances(self, chances: Sequence[FloatArray]) -> list[StepError]:
         """Return the errors of mean probabilities of detection, each but the first compared with the one before it.
 

@@ -213,6 +213,16 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         desk.wait()
         assert desk.ok("GET", "/api/plan")["sensors"][0]["adds_text"] == [adds]
 
+        desk.ok("PUT", "/api/obstacles", {"obstacles": [lorry]})
+        desk.ok("POST", "/api/what_if", {})
+        desk.wait()
+        assert re.match(
+            r"With the obstacles, EGVS of the plan of 1 sensor is [\d,]+ ± [\d,]+ bit instead of [\d,]+ ± [\d,]+ bit "
+            r"\(change -?[\d,]+ ± [\d,]+ bit\)\.$", desk.ok("GET", "/api/what_if")["text"][0],
+        )  # fmt: skip
+        desk.ok("PUT", "/api/obstacles", {"obstacles": []})
+        assert not desk.project["run"]["plan_outdated"]
+
         digest = desk.project["files"]
         desk.ok("POST", "/api/trial", {"site": "pole_b", "sensor": "VLP-16"})
         tried = desk.wait()["result"]
@@ -263,9 +273,10 @@ def test_mistakes_with_maps_are_explained(desk: Client) -> None:
     )
     dropped = desk.ok("POST", "/api/maps?name=bare.osm", bare)
     desk.ok("POST", "/api/new", {"map": dropped["id"], "name": "bare", "at": None, "poles": "existing"})
-    failed = desk.wait("failed")
-    assert failed["message"].startswith("Poles of the map: no map has a street lamp")
-    assert failed["hint"] == "Choose new poles at the kerbs."
+    made = desk.wait()["result"]
+    assert made["note"].startswith("The candidates are new poles at the kerbs: no map has a street lamp")
+    assert made["note"] == made["notes"][0] == desk.project["notes"][0]
+    assert desk.project["sites"] and not any(site["exists"] for site in desk.project["sites"])
     for body, field in (
         ({"map": "m9", "name": "x"}, ""), ({"map": dropped["id"], "name": "../x"}, "name"),
         ({"map": dropped["id"], "name": "x", "at": [1]}, "at"),

@@ -9,10 +9,12 @@ import base64
 import re
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,8 @@ from tests.extensions.desk.test_aerial import write_picture
 
 WAIT_MS, JOB_MS = 20_000, 180_000
 REFUSED = re.compile(r"Failed to load resource: .* status of 4(09|13|15|22) ")
+BERLIN = Path(__file__).parents[4] / "shared" / "real" / "berlin_neukoelln.osm.gz"
+"""A real map with street lamps; not part of the project."""
 STEPS = ("Poles", "Traffic", "Run", "Decide", "Take along")
 
 pytestmark = [
@@ -259,6 +263,8 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
     tab.get_by_role("heading", name="Ranking").wait_for(timeout=JOB_MS)
     table = tab.get_by_role("table", name="Poles, best first")
     assert sorted(table.locator("tbody th").all_inner_texts()) == ["lamp1", "new1", "signal1"]
+    tab.get_by_text("the most serious first").click()
+    tab.locator(".warnings li", has_text="60 frames").wait_for()
     assert_accessible(tab)
 
     tab.get_by_role("button", name="Next: Decide").click()
@@ -283,6 +289,93 @@ def test_from_an_empty_folder_to_a_plan_and_its_files(
             tab.get_by_title(title).click()
         assert Path(download.value.path()).read_bytes().startswith(begin)
     assert (folder / "town" / "scenario.toml").is_file() and (folder / "runs" / "town" / "scores.parquet").is_file()
+
+
+@pytest.mark.parametrize("source", [MAP, BERLIN], ids=["made_up", "berlin"])
+def test_planned_in_the_browser_is_ranked_the_same_by_the_command_line(
+    source: Path, open_page: Callable[..., Any], folder: Path, tmp_path: Path
+) -> None:
+    if not source.is_file():
+        pytest.skip(f"{source.name} is not beside the checkout (shared/real)")
+    tab = open_page(accept_downloads=True)
+    tab.set_input_files("#map-file", source)
+    tab.get_by_role("heading", name="Which junction?").wait_for(timeout=JOB_MS)
+    tab.locator("tbody tr", has_text="yes").first.get_by_role("button").click()
+    type_into(tab, "Name", "junction")
+    tab.get_by_role("button", name="Make the scenario").click()
+    tab.locator(".item.pole.existing").first.wait_for(timeout=JOB_MS)
+    existing = [site["site"] for site in state(tab)["project"]["sites"]]
+    tab.get_by_role("button", name="Show kerb positions").click()
+    tab.locator(".item.suggestion").first.wait_for()
+    tab.mouse.click(*middle(tab.locator(".item.suggestion .body").first))
+    wait_until(tab, lambda: len(state(tab)["project"]["sites"]) == len(existing) + 1)
+    type_into(tab, "Heights, m", "4,5")
+    type_into(tab, "Tilts, °", "-5")
+    wait_until(tab, lambda: state(tab)["project"]["mounts"]["pitch_deg"] == [-5])
+
+    tab.get_by_role("button", name="Next: Traffic").click()
+    fields = tab.locator(".approach input")
+    for number, count in enumerate((90, 28.5)):
+        fields.nth(number).fill(str(count))
+        fields.nth(number).press("Enter")
+    wait_until(
+        tab, lambda: [m["count_per_h"] for m in state(tab)["project"]["counts"][0]["movements"]].count(28.5) == 1
+    )
+    tab.get_by_role("button", name="Next: Run").click()
+    type_into(tab, "Moments of traffic to record, one every 1 s", "500")
+    wait_until(tab, lambda: state(tab)["project"]["settings"]["frames"] == 500)
+    tab.get_by_role("button", name="Start the run").click()
+    tab.get_by_role("heading", name="Ranking").wait_for(timeout=JOB_MS)
+    tab.get_by_role("button", name="Next: Decide").click()
+    find = tab.get_by_role("button", name="Find the best 2 poles")
+    find.click()
+    planned = tab.get_by_role("heading", name="2 sensors:")
+    planned.wait_for(timeout=JOB_MS)
+    first = tab.locator(".item.sensor").first.get_attribute("data-id")
+    before = site(tab, first)
+    for step in ((8, 0), (0, 8), (-8, 0), (0, -8), (16, 0), (0, 16), (-16, 0), (0, -16)):
+        x, y = pixel(tab, first)
+        drag(tab, (x, y), (x + step[0], y + step[1]))
+        dialog = tab.get_by_role("dialog").get_by_role("button", name="Change", exact=True)
+        refusal = tab.get_by_text("Not here:").first
+        dialog.or_(refusal).first.wait_for()
+        if dialog.is_visible():
+            dialog.click()
+            break
+    wait_until(tab, lambda: site(tab, first) != before)
+    tab.get_by_role("heading", name="Plan before the changes").wait_for()
+    find.click()
+    planned.wait_for(timeout=JOB_MS)
+    tab.get_by_role("button", name="Parked lorry").click()
+    wait_until(tab, lambda: len(state(tab)["project"]["obstacles"]) == 1)
+    tab.get_by_role("button", name="What changes?").click()
+    tab.get_by_text(re.compile("^With the obstacles, .* of the plan of 2 sensors is ")).wait_for(timeout=JOB_MS)
+
+    go(tab, "Take along")
+    for title, begin in (("Installation sheets", b"PK"), ("GeoPackage", b"SQLite")):
+        with tab.expect_download(timeout=JOB_MS) as download:
+            tab.get_by_title(f"Save {title}").click()
+        assert Path(download.value.path()).read_bytes().startswith(begin)
+    words = [sys.executable, "-m", "egvs", "run", "junction", "--out", str(tmp_path / "again")]
+    subprocess.run(words, cwd=folder, check=True, capture_output=True)
+    scores = [run / "scores.parquet" for run in (folder / "runs" / "junction", tmp_path / "again")]
+    assert scores[0].read_bytes() == scores[1].read_bytes()
+
+
+def test_counts_are_a_list_where_they_have_no_room_on_the_map(town: Any) -> None:
+    go(town, "Traffic")
+    assert town.locator(".diagram.listed").count() == 0
+    town.set_viewport_size({"width": 1280, "height": 360})
+    town.locator(".diagram.listed").wait_for()
+    boxes = [card.bounding_box() for card in town.locator(".approach").all()]
+    assert all(above["y"] + above["height"] <= below["y"] for above, below in pairwise(boxes))
+    field = town.locator(".approach input").last
+    field.fill("31")
+    field.press("Enter")
+    wait_until(town, lambda: state(town)["project"]["counts"][0]["movements"][-1]["count_per_h"] == 31)
+    assert violations(town) == []
+    town.set_viewport_size({"width": 1280, "height": 800})
+    town.locator(".diagram:not(.listed)").wait_for()
 
 
 def test_broken_map_is_explained(open_page: Callable[..., Any], tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -31,16 +32,25 @@ MOST_SOLIDS = 4000
 def describe_streets(streets: Streets, attribution: str) -> dict[str, Any]:
     """Return the streets of a map and the junctions of which a scenario can be made, the largest first.
 
-    ``attribution`` says who made the map.
+    ``attribution`` says who made the map. Junctions of the same streets are numbered.
     """
     lanes = list(_lanes(streets.network))
+    crossings = junctions.distinct_crossings(streets)
+    totals, numbers = Counter(junction.title for junction in crossings), Counter[str]()
+    described = []
+    for junction in crossings:
+        numbers[junction.title] += 1
+        title, total = junction.title, totals[junction.title]
+        if total > 1:
+            title += f" ({numbers[junction.title]} of {total})"
+        described.append({**_describe_junction(streets, junction), "title": title})
     points_m = [point for lane in lanes for point in lane["points_m"]]
     low, high = np.min(points_m, axis=0), np.max(points_m, axis=0)
     return {
         "bounds_m": [*low.tolist(), *high.tolist()],
         "frame": None if streets.frame is None else [streets.frame.projection, streets.frame.offset_m],
         "lanes": lanes,
-        "junctions": [_describe_junction(streets, each) for each in junctions.distinct_crossings(streets)],
+        "junctions": described,
         "attribution": attribution,
     }
 

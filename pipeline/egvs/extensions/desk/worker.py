@@ -24,7 +24,9 @@ from egvs.extensions.desk.refusals import describe_error
 
 if TYPE_CHECKING:
     from egvs.results.plans import SensorPlan
+    from egvs.scenario.model import Scenario
     from egvs.stages.base import StageContext
+    from egvs.studies.what_if import WhatIfRun
 
 _INTERVAL_S = 0.15
 Send = Callable[[dict[str, Any]], None]
@@ -75,20 +77,24 @@ def download_map(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
 
 
 def create(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
-    """Make a scenario, as ``egvs new``."""
+    """Make a scenario, as ``egvs new``; where the map has no poles at the junction, with new ones at the kerbs."""
+    from dataclasses import replace
+
     from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
 
     progress.report("makes the scenario", 0, 0)
+    at = None if request["at"] is None else (request["at"][0], request["at"][1])
     options = NewScenarioOptions(
         existing_poles=request["poles"] == "existing", traffic=request["traffic"], walk=request["walk"]
     )
-    at = request["at"]
     try:
-        made = create_scenario(request["folder"], request["map"], None if at is None else (at[0], at[1]), options)
+        made = create_scenario(request["folder"], request["map"], at, options)
     except InputError as error:
         if error.where != "--poles existing":
             raise
-        raise InputError("Poles of the map", error.problem, "Choose new poles at the kerbs.") from None
+        made = create_scenario(request["folder"], request["map"], at, replace(options, existing_poles=False))
+        note = f"The candidates are new poles at the kerbs: {error.problem}."
+        return {"notes": [note, *made.notes], "note": note}
     return {"notes": list(made.notes)}
 
 
@@ -139,10 +145,11 @@ def describe_additions(progress: Progress, request: dict[str, Any]) -> dict[str,
 def try_sensor(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
     """Score the plan with the sensors of another table of sites."""
     from egvs.extensions.desk import plan_sensors
+    from egvs.scenario.loading import load
 
     progress.report("scans and scores", 0, 0)
     with _open_plan(request) as (context, planned):
-        changed = _open_run(request, request["settings"])
+        changed = _open_run(load(request["scenario"], request["settings"]), Path(request["run"]))
         tried = plan_sensors.try_sensors(context, planned, changed)
     by = planned.by
     sign = "+" if tried.joint > planned.joint else ""
@@ -161,26 +168,25 @@ def _open_plan(request: dict[str, Any]) -> Iterator[tuple[StageContext, SensorPl
     from egvs.core.digests import use_digests
     from egvs.results.plans import SensorPlan
     from egvs.runs.run import lock_run_folder
+    from egvs.scenario.loading import load
 
     folder = Path(request["run"])
     with lock_run_folder(folder):
         planned = SensorPlan.read(RunFolder(folder))
         assert planned is not None, "the plan was removed"
-        context = _open_run(request)
+        context = _open_run(load(request["scenario"]), folder)
         with use_digests(context.inputs.digests):
             yield context, planned
 
 
-def _open_run(request: dict[str, Any], settings: Sequence[str] = ()) -> StageContext:
-    """Open the run of a scenario; further settings may change the sensors only."""
+def _open_run(scenario: Scenario, folder: Path) -> StageContext:
+    """Open the run of a scenario, whose sensors may be others since."""
     from egvs.artefacts.run_record import RunRecord
     from egvs.runs import stage_registry
     from egvs.runs.run_context import open_folder
-    from egvs.scenario.loading import load
 
-    folder = Path(request["run"])
     recorded = stage_registry.recorded_digests(RunRecord.read(folder))
-    return open_folder(load(request["scenario"], settings), folder, recorded=recorded)
+    return open_folder(scenario, folder, recorded=recorded)
 
 
 def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
@@ -216,7 +222,29 @@ def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str,
         answer, best_before=titles[answer.best_before], best_expected=titles[answer.best_expected],
         rival=titles.get(answer.rival, ""),
     )  # fmt: skip
-    return {"text": [answer.conclusion(), *result.notes], "sites": rows}
+    text = [answer.conclusion(), *result.notes]
+    if request["has_plan"]:
+        text.insert(0, _describe_changed_plan(request, result.runs[1], answer.impossible))
+    return {"text": text, "sites": rows}
+
+
+def _describe_changed_plan(request: dict[str, Any], changed: WhatIfRun, impossible: Sequence[str]) -> str:
+    """Say what the obstacles change of the joint score of the plan."""
+    from egvs.core.wording import number_of
+    from egvs.extensions.desk import plan_sensors
+
+    with _open_plan(request) as (context, planned):
+        plan_text = f"the plan of {number_of(len(planned.sensors), 'sensor')}"
+        if gone := [sensor.pole or sensor.site for sensor in planned.sensors if sensor.site in impossible]:
+            return f"With the obstacles, {plan_text} is not possible: {gone[0]} is in the way."
+        if any(sensor.mount.points for sensor in planned.sensors):
+            return f"What changes for {plan_text} is unknown: an empty scan was measured without the obstacles."
+        other = _open_run(changed.scenario, changed.folder)
+        score = plan_sensors.score_in_other_world(context, planned, other)
+    by = planned.by
+    before, after = by.with_unit(planned.joint, planned.joint_se), by.with_unit(score.joint, score.joint_se)
+    change = f"{by.change(score.joint - planned.joint, score.change_se)} {by.change_unit}".rstrip()
+    return f"With the obstacles, {by.noun} of {plan_text} is {after} instead of {before} (change {change})."
 
 
 def describe_traffic(_progress: Progress, request: dict[str, Any]) -> dict[str, Any]:

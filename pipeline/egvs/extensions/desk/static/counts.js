@@ -82,6 +82,9 @@ const cards = h("div.cards");
 const periods = h("div.periods");
 const diagram = h("div.diagram", {}, arrows, periods, cards);
 const sizes = new ResizeObserver(() => place());
+/** Size of the map on which the cards had no room beside each other. */
+let crowded = "";
+let wasListed = false;
 
 export function drawDiagram() {
   const stage = byId("stage");
@@ -101,6 +104,7 @@ export function drawDiagram() {
   map.onPlace = place;
   if (fitted !== data.project.id + data.map.key) {
     fitted = data.project.id + data.map.key;
+    crowded = "";
     map.fit(boxOfMovements());
   } else place();
 }
@@ -120,8 +124,9 @@ function boxOfMovements() {
   if (!points.length) return boxAround();
   const [xs, ys] = [0, 1].map((axis) => points.map((/** @type {number[]} */ point) => point[axis]));
   const [x0, x1, y0, y1] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
-  const [x, y, half] = [(x0 + x1) / 2, (y0 + y1) / 2, Math.max(x1 - x0, y1 - y0, 20) * 0.85];
-  return [x - half, y - half, x + half, y + half];
+  const [x, y, half] = [(x0 + x1) / 2, (y0 + y1) / 2, Math.max(x1 - x0, y1 - y0, 20) * (crowded ? 0.6 : 0.85)];
+  const taken = crowded ? cards.offsetWidth / Math.max(1, mapView().width - cards.offsetWidth) : 0; // left of the map
+  return [x - half - 2 * half * taken, y - half, x + half, y + half];
 }
 
 /** @param {any} approach @param {boolean} isLocked */
@@ -162,7 +167,15 @@ function highlight(index) {
 
 function place() {
   if (!diagram.isConnected) return;
-  placeCards();
+  const map = mapView();
+  const size = `${map.width} ${map.height}`;
+  if (crowded !== size) crowded = placeCards() ? "" : size;
+  const isListed = crowded !== "";
+  if (diagram.classList.toggle("listed", isListed) !== wasListed) {
+    wasListed = isListed;
+    map.fit(boxOfMovements());
+    return; // it has called this
+  }
   placeArrows();
 }
 
@@ -197,9 +210,11 @@ function leader(card) {
   return s("path.leader", { d: `M${x} ${y}L${end.join(" ")}` });
 }
 
-/** Put each card at the edge of the map, on the side of its approach, so that no two overlap. */
+/** Put each card at the edge of the map, on the side of its approach. @returns {boolean} whether no two overlap, and the middle is free */
 function placeCards() {
   const map = mapView();
+  diagram.classList.remove("listed");
+  if (!cards.firstElementChild || getComputedStyle(cards.firstElementChild).position !== "absolute") return true; // on phones they are below it
   const places = /** @type {HTMLElement[]} */ ([...cards.children]).map((card, number) => {
     const [x, y] = map.toPixel(counts().approaches[number].at_m);
     const [dx, dy] = [x - map.width / 2, y - map.height / 2];
@@ -208,11 +223,14 @@ function placeCards() {
     const scale = 1 / Math.max(Math.abs(dx) / roomX, Math.abs(dy) / roomY, 1e-6);
     return { card, x: map.width / 2 + dx * scale - w / 2, y: map.height / 2 + dy * scale - height / 2, w, h: height };
   });
-  for (let round = 0; round < 80; round += 1) if (!pushApart(places, map)) break;
+  let rounds = 80;
+  while (rounds > 0 && pushApart(places, map)) rounds -= 1;
   for (const { card, x, y } of places) {
     card.style.left = `${Math.round(x)}px`;
     card.style.top = `${Math.round(y)}px`;
   }
+  const isInMiddle = (/** @type {number} */ at, /** @type {number} */ size, /** @type {number} */ room) => at < (2 * room) / 3 && at + size > room / 3;
+  return rounds > 0 && !places.some(({ x, y, w, h: height }) => isInMiddle(x, w, map.width) && isInMiddle(y, height, map.height));
 }
 
 /** @typedef {{card: HTMLElement, x: number, y: number, w: number, h: number}} Place */

@@ -103,7 +103,7 @@ function deskItems() {
     const score = pole ? `, rank ${pole.rank}: ${pole.score_text}` : sensor ? `, sensor ${sensor.order}` : "";
     return {
       id: site.site, at_m: [site.x_m, site.y_m], label: site.site, kind: sensor ? "sensor" : "pole", classes,
-      movable: project.sites_editable && !isBusy(), text: sensor ? String(sensor.order) : pole && pole.rank <= 9 ? String(pole.rank) : "",
+      movable: project.sites_editable && !isBusy(), text: sensor ? String(sensor.order) : pole && pole.rank <= 99 ? String(pole.rank) : "",
       title: `${site.site}, ${kindOf(site)}${moved}${score}`,
     };
   });

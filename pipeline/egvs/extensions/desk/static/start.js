@@ -133,7 +133,7 @@ function drawJunctions(panel) {
     } }),
     radioField({
       name: "poles", label: "Candidates to begin with", value: choice.poles,
-      choices: [["existing", "Poles of the map", "Street lamps, signal masts and utility poles."], ["kerbs", "New poles at the kerbs", "About every 10 m."]],
+      choices: [["existing", "Poles of the map", "Street lamps, signal masts and utility poles; where there are none, new poles at the kerbs."], ["kerbs", "New poles at the kerbs", "About every 10 m."]],
       send(value) {
         choice.poles = value;
       },
@@ -156,13 +156,9 @@ async function make(junction) {
   if (data.start.scenarios.some((/** @type {any} */ other) => other.name === choice.name)) return say(`“${choice.name}” exists already. Choose another name.`, "error");
   const body = { map: data.upload.id, name: choice.name, at: junction.at, poles: choice.poles, traffic: choice.traffic };
   location.hash = "poles";
-  const job = await runJob("new", body, (error) => {
-    if (choice.poles === "existing" && !error.field) choice.poles = "kerbs"; // most often, the map has no poles there
-    update({ upload: data.upload });
-    say(error.message, "error");
-  });
+  const job = await runJob("new", body);
   if (job) {
     update({ upload: null });
-    say("The scenario is ready.");
+    say(job.result.note ?? "The scenario is ready.");
   }
 }
