@@ -562,7 +562,7 @@ def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: 
         f"carries at least {traffic.assumed_per_h:,} vehicles an hour; {level} {100 * share:.0f} % is used"
     )
     text = (tmp_path / "out" / "scenario.toml").read_text(encoding="utf-8")
-    assert f"the network {traffic.summary}. Replace its numbers by real counts" in text
+    assert 'counts = "counts.csv" # assumed from the road classes: replace its numbers by real counts' in text
     loaded = loading.load(tmp_path / "out")
     assert (loaded.traffic.junction_blocker_s, loaded.traffic.teleport_s) == (10.0, 120.0)
 

@@ -4,6 +4,7 @@ import re
 import shutil
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -204,7 +205,7 @@ def test_untouched_tables_change_nothing(made_scenario: Path, tmp_path: Path) ->
     assert any("traffic" in entry for entry in scenario.assumed)
 
 
-def test_edited_tables_are_used_and_stay(made_scenario: Path, tmp_path: Path) -> None:
+def test_edited_tables_are_used_and_stay(made_scenario: Path, tmp_path: Path, run_egvs: Any) -> None:
     shutil.copytree(made_scenario, tmp_path / "made")
     counts, signals_table = tmp_path / "made" / "counts.csv", tmp_path / "made" / "signals.csv"
     header, first, *rest = counts.read_text().splitlines()
@@ -212,6 +213,8 @@ def test_edited_tables_are_used_and_stay(made_scenario: Path, tmp_path: Path) ->
     counts.write_text("\n".join([header.replace(",", ";"), edited, *(row.replace(",", ";") for row in rest)]) + "\n")
     signals_table.write_text(re.sub(r",\d+$", ",17", signals_table.read_text(), flags=re.MULTILINE))
     scenario = load(tmp_path / "made")
+    _, checked, _ = run_egvs("check", tmp_path / "made")
+    assert re.search(r"Signals at .* \(signals\.csv\): actuated, cycle up to 44 s; green up to 17 s ", checked)
     assert scenario.traffic.counts[0].per_hour == 1234.5
     assert scenario.traffic.counts[1:] == load(made_scenario).traffic.counts[1:]
     network = tmp_path / "made" / "network.net.xml"

@@ -79,7 +79,7 @@ def edge_turns(made: StreetNetwork) -> set[tuple[str, str]]:
 
 def notes(made: StreetNetwork) -> tuple[str, ...]:
     """The notes on turns, without the one on U-turns."""
-    return tuple(note for note in made.notes if "U-turn" not in note and "assumed by road class" not in note)
+    return tuple(note for note in made.notes if "U-turn" not in note and "by road class" not in note)
 
 
 def divided_road() -> tuple[MapDraft, dict[str, int]]:

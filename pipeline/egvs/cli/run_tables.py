@@ -36,6 +36,7 @@ from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pol
 from egvs.scenario.score_config import ALL_DETECTORS, DEFAULT_SCORE, NOTICED
 from egvs.sensors.return_model import NEGLIGIBLE_LOSS, ReturnModel
 from egvs.sensors.sensor import FEW_BEAMS, FEW_BEAMS_HINT, describe_few_beams
+from egvs.traffic.signal_descriptions import format_plan
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
@@ -322,6 +323,8 @@ def print_check(checked: CheckReport, *, with_details: bool = False) -> None:
         if hidden := len(checked.poles) - len(shown):
             out.print(f"{hidden} more poles; --verbose lists them")
         out.print("kerb: distance to the edge of the carriageway; wall: to the nearest building or other surface")
+    for plan in checked.signals:
+        out.print(format_plan(plan))
     for severity, findings in (("error", checked.errors), ("warning", checked.warnings), ("note", checked.notes)):
         if not findings:
             continue

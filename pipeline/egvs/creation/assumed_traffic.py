@@ -126,12 +126,9 @@ class AssumedTraffic:
     def add_keys(self, table: Any, streets: Streets, junction: StreetJunction) -> None:
         """Name the table of the counts, and add a template for periods, to ``[traffic]``."""
         table.update({"counts": scenario_files.COUNTS_FILE})
-        origin = f"assumed from the road classes ({self.assumed_per_h:,} vehicles an hour)"
-        if self.level is None:
-            origin = "divided among the movements by the road classes"
-        table["counts"].comment(f"{origin}; the network {self.summary}. Replace its numbers by real counts")
-        for line in scenario_files.periods_template(self.flows[0]):
-            table.add(tomlkit.comment(line))
+        origin = "assumed from the road classes" if self.level is not None else "divided by the road classes"
+        table["counts"].comment(f"{origin}: replace its numbers by real counts")
+        table.add(tomlkit.comment(scenario_files.PERIODS_HINT))
 
 
 class NoTraffic:

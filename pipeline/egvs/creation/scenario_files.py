@@ -53,20 +53,14 @@ TomlTable = tuple[str, dict[str, Any]]
 
 _KEY_COMMENTS = {  # of tables and keys; the table of a key above all tables is ""
     ("", "assumed"): "shown with the ranking; remove what you replace by measurements",
-    (
-        "traffic",
-        "junction_blocker_s",
-    ): "vehicles drive through one that blocks them on a junction; overlaps are counted",
-    ("traffic", "teleport_s"): "the last resort against locks; vehicles that are moved on are counted",
-    ("score", "rank_by"): "the expected share of vehicles that detectors find; docs/validity.md",
-    ("score", "zones"): "results are also reported for these areas; edit, add or remove them as you like",
-    ("sites", "existing_poles"): "names of poles that stand already, or 'all': they cost nothing, and are not assumed",
-    ("sites", "sensor"): "or a list, such as ['VLP-32C', 'OS1-64']: each is a candidate",
-    ("sites", "aim"): "sensors face the centre of the region",
-    (
-        "sites",
-        "pitch_deg",
-    ): "each height with each tilt is a candidate; 'aim' points the central ray at the centre: for narrow views",
+    ("traffic", "junction_blocker_s"): "vehicles drive through one that blocks them; overlaps are counted",
+    ("traffic", "teleport_s"): "the last resort against locks; moved vehicles are counted",
+    ("score", "rank_by"): "the share of vehicles that detectors should find",
+    ("score", "zones"): "areas with results of their own",
+    ("sites", "existing_poles"): "poles that stand already, or 'all': they cost nothing",
+    ("sites", "sensor"): "or a list: each is a candidate",
+    ("sites", "aim"): "the centre of the region",
+    ("sites", "pitch_deg"): "each with each height; 'aim' points the central ray at the centre",
 }
 
 
@@ -145,7 +139,7 @@ def reachable_area(roi: JunctionRegion) -> BaseGeometry:
 
 def roi_table(roi: JunctionRegion, z_range_m: tuple[float, float] = (0.0, junctions.ROI_HEIGHT_M)) -> TomlTable:
     """Return ``[roi]`` without the voxel size; ``z_range_m`` is its bottom and top."""
-    comment = "the box in which visibility counts; its size is a whole number of voxels along each axis"
+    comment = "the box in which visibility counts, a whole number of voxels along each axis"
     low_m, high_m = z_range_m
     return comment, {"center_m": [*roi.center_m, (low_m + high_m) / 2], "size_m": [*roi.size_m, high_m - low_m]}
 
@@ -157,7 +151,7 @@ def voxel_keys() -> dict[str, Any]:
 
 def statics_table(meshes: Sequence[str] = (), terrain: str | None = None) -> TomlTable:
     """Return ``[statics]`` with mesh files, each named after the kind of its objects, and a terrain file."""
-    comment = "buildings, trees, barriers, poles; the summary in the file counts what was assumed about them"
+    comment = "buildings, trees, barriers, poles, and what was assumed about them"
     keys: dict[str, Any] = {"footprints": [STATICS_FILE]}
     if meshes:
         keys["meshes"] = [{"file": name, "kind": name.removesuffix(".ply")} for name in meshes]
@@ -171,12 +165,11 @@ def sites_table(existing: Sequence[str] | None = None) -> TomlTable:
 
     ``existing`` are the poles whose positions are known where all exist; None for locations along the kerbs.
     """
-    position = "columns longitude, latitude (degrees) work as well as x_m, y_m"
-    poles = f"poles {junctions.KERB_M:g} m behind the kerbs of the junction"
+    poles = f"poles {junctions.KERB_M:g} m behind the kerbs"
     keys: dict[str, Any] = {"file": SITES_FILE, "existing_poles": list(existing or ())}
     if existing is not None:
-        poles = "poles of the map; those that were moved (moved_m) are not among existing_poles before you checked them"
-    return f"{poles}; add or remove rows as you like; {position}", keys
+        poles = "poles of the map; check those with moved_m, and add them to existing_poles"
+    return f"{poles}; columns longitude, latitude (degrees) may replace x_m, y_m", keys
 
 
 def mount_keys() -> dict[str, Any]:
@@ -194,7 +187,7 @@ def score_table(zones_file: str | None = None) -> TomlTable:
 
 def placement_table() -> TomlTable:
     """Return ``[placement]``: without a limit, a plan may put two sensors in the same place."""
-    comment = 'rules for egvs place; for --budget, add a table [costs]: sensor = {"VLP-32C" = 8000}, pole = 2000'
+    comment = 'for --budget, add a table [costs]: sensor = {"VLP-32C" = 8000}, pole = 2000'
     return comment, {"most_per_pole": 1}
 
 
@@ -294,15 +287,7 @@ def _inline_table(values: Mapping[str, Any]) -> Any:
     return row
 
 
-def periods_template(example: CountConfig) -> list[str]:
-    """Return comment lines that show how parts of the day are written."""
-    return [
-        "Parts of the day (peaks): one such table for each, with counts in rows as above; docs/scenarios.md, Periods",
-        "[[traffic.periods]]",
-        'name = "morning"',
-        "weight = 3 # hours",
-        f"counts = [{_count_row(example).as_string()}]",
-    ]
+PERIODS_HINT = "For peaks, add tables [[traffic.periods]] (docs/scenarios.md, Periods)."
 
 
 FileContent = str | Callable[[Path], None]

@@ -1,4 +1,4 @@
-"""Describe the signal plans that were simulated, for the answer of a run and for its report."""
+"""Describe signal plans, for ``egvs check``, for the answer of a run and for its report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from egvs.scenario.model import Scenario
 from egvs.traffic import network
 from egvs.traffic.assumed_plans import is_assumed
 from egvs.traffic.directions import CLOCKWISE, COMPASS
-from egvs.traffic.signal_plans import find_signal
+from egvs.traffic.signal_plans import find_signal, planned_signals
 from egvs.traffic.signals import (
     CROSSING,
     GREEN_LETTERS,
@@ -34,7 +34,15 @@ _MAX_PHASES = 100
 
 def describe_simulated(scenario: Scenario, path: Path, roads: network.Network) -> list[dict[str, Any]]:
     """Return :func:`describe_signals` for the network that was simulated; parameters as in :func:`apply_plans`."""
-    found = read_signals(path, roads)
+    return _describe(scenario, read_signals(path, roads))
+
+
+def describe_planned(scenario: Scenario, path: Path, roads: network.Network) -> list[dict[str, Any]]:
+    """Return :func:`describe_signals` for the network of a scenario, with its plans; parameters as above."""
+    return _describe(scenario, planned_signals(scenario, path, roads))
+
+
+def _describe(scenario: Scenario, found: Sequence[Signal]) -> list[dict[str, Any]]:
     planned = {}
     for name, config in scenario.traffic.signals.items():
         signal = find_signal(name, found, f"{scenario.file}: traffic.signals.{name}")

@@ -64,6 +64,13 @@ def check_plans(scenario: Scenario, path: Path, roads: network.Network) -> None:
     _programs(scenario, path, roads)
 
 
+def planned_signals(scenario: Scenario, path: Path, roads: network.Network) -> list[Signal]:
+    """Return the signals of a network with the plans of the scenario; parameters as in :func:`apply_plans`."""
+    programs = _programs(scenario, path, roads)
+    signals = read_signals(path, roads)
+    return [replace(signal, program=programs.get(signal.id, signal.program)) for signal in signals]
+
+
 def apply_plans(scenario: Scenario, path: Path, source: Path) -> None:
     """Replace the programs in a network by the plans of the scenario.
 

@@ -652,11 +652,9 @@ def _notes(before: StreetTurns, after: StreetTurns) -> Iterator[str]:
         added=[graph.title(pair, after.relations[pair]) for pair in after.added],
     )
     if count := len(after.turns_back):
-        turns = list_turns(graph.title(pair) for pair in after.turns_back)
-        yield (
-            f"{number_of(count, 'U-turn')} {by_number(count, 'is', 'are')} left out, since vehicles that wait to turn"
-            f" back block a street: {turns}."
-        )
+        turns = list_first([graph.title(pair) for pair in after.turns_back], 1)
+        left_out = f"{number_of(count, 'U-turn')} {by_number(count, 'is', 'are')} left out"
+        yield f"{left_out}, since vehicles that wait to turn block a street: {turns}."
     if count := len(after.off_arrows):
         turns = list_turns(graph.title((lane.source, lane.target)) for lane in after.off_arrows)
         subject = f"{number_of(count, 'connection')} of lanes {by_number(count, 'does', 'do')}"
@@ -682,11 +680,11 @@ def _assumption_notes(graph: StreetGraph) -> Iterator[str]:
     """Yield sentences on the lanes and speed limits that are netconvert's defaults."""
     lanes = Counter(edge.lanes for edge in graph.edges_without(_LANE_KEYS))
     if lanes:
-        yield f"Numbers of lanes that the map does not state are assumed by road class: {_edge_counts(lanes)}."
+        yield f"Lanes that the map does not state, by road class: {_edge_counts(lanes)}."
     speeds_km_h = Counter(round(edge.speed_m_s * 3.6) for edge in graph.edges_without(_SPEED_KEYS))
     if speeds_km_h:
         counts = _edge_counts(speeds_km_h, " km/h")
-        yield f"Speed limits that the map does not state are assumed by road class: {counts}."
+        yield f"Speed limits that the map does not state, by road class: {counts}."
 
 
 def _edge_counts(values: Counter[int], unit: str = "") -> str:

@@ -145,8 +145,7 @@ class TrackDemand:
         table.add(
             tomlkit.comment("The profile of the day is not extrapolated from the recording; it is yours to enter.")
         )
-        for line in scenario_files.periods_template(max(self.flows, key=lambda flow: flow.per_hour)):
-            table.add(tomlkit.comment(line))
+        table.add(tomlkit.comment(scenario_files.PERIODS_HINT))
 
 
 def estimate_demand(recording: MatchedRecording, streets: Streets, junction: StreetJunction) -> TrackDemand:
