@@ -17,16 +17,18 @@ EXTENSIONS := city desk hardware maps tracks validation
 TRAINING := tests/extensions/validation/training
 # Pages, studies and damaged files of all parts of the program.
 COMPLETE_TESTS := tests/benchmarks tests/docs tests/fuzz tests/install
+# Files of the core with tests that need an extension: those tests run with all of them.
+MIXED_TESTS := $(filter-out tests/extensions/% $(COMPLETE_TESTS:=/%),$(shell grep -rl --include='test_*.py' 'tests.installed import' tests))
 
 # Tests of the core run in a copy without any extension; those of extensions and of the complete program, with all.
 test: $(VENV)/.installed-dev
 	$(BIN)/python .ci/without.py $(EXTENSIONS) --tests "not slow" --leave-out $(COMPLETE_TESTS)
-	$(BIN)/python -m pytest -m "not slow" --ignore=$(TRAINING) tests/extensions $(COMPLETE_TESTS)
+	$(BIN)/python -m pytest -m "not slow and complete" --ignore=$(TRAINING) tests/extensions $(COMPLETE_TESTS) $(MIXED_TESTS)
 
 # Sweeps, whole studies, browsers, kills: what takes more than some tenths of a second each.
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python .ci/without.py $(EXTENSIONS) --tests "slow and not nightly" --leave-out $(COMPLETE_TESTS)
-	$(BIN)/python -m pytest -m "slow and not nightly" --ignore=$(TRAINING) tests/extensions $(COMPLETE_TESTS)
+	$(BIN)/python -m pytest -m "slow and not nightly and complete" --ignore=$(TRAINING) tests/extensions $(COMPLETE_TESTS) $(MIXED_TESTS)
 
 # Each extension is taken away alone: imports, main commands, and the same artefacts as with all of them.
 without: $(VENV)/.installed-dev

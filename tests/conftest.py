@@ -15,6 +15,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from tests.installed import mark_complete
 from tests.system_tests import SYSTEM
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)  # the same examples in every run
@@ -124,6 +125,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark tests `system` or `unit`, and start the longest first, so that no worker waits for them at the end."""
     items.sort(key=lambda item: not item.nodeid.startswith(LONGEST))
     for item in items:
+        mark_complete(item)
         if item.nodeid.startswith(SYSTEM):
             item.add_marker("system")
         if not any(item.iter_markers("system")) and not any(item.iter_markers("slow")):

@@ -8,7 +8,6 @@ import itertools
 import json
 import math
 import re
-import shutil
 from collections import Counter
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -274,16 +273,6 @@ def test_each_count_has_its_movement_in_words(made: Made) -> None:
     assert ["North Street (south)", "straight", "North Street"] in words
     assert ["North Street (south)", "left", "East Street"] in words
     assert ["East Street (west)", "right", "North Street"] in words
-
-
-def test_template_of_periods_can_be_used(made: Made, tmp_path: Path) -> None:
-    shutil.copytree(made[0], tmp_path / "copy")
-    path = tmp_path / "copy" / "scenario.toml"
-    before, marker, after = path.read_text(encoding="utf-8").partition("# [[traffic.periods]]\n")
-    template = re.sub(r"^# ", "", marker + after, flags=re.MULTILINE)
-    path.write_text(before + template, encoding="utf-8")
-    (period,) = loading.load(tmp_path / "copy").traffic.periods
-    assert (period.name, period.counts) == ("morning", made[1].flows[:1])
 
 
 def test_printed_solids_are_those_of_the_check(made: Made, capsys: pytest.CaptureFixture[str]) -> None:

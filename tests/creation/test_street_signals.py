@@ -199,7 +199,7 @@ def test_untouched_tables_change_nothing(made_scenario: Path, tmp_path: Path) ->
     shutil.copy(network, tmp_path)
     apply_plans(scenario, tmp_path / network.name, network)
     assert (tmp_path / network.name).read_text() == network.read_text()
-    (plan,) = describe_simulated(scenario, network, read_net_xml(network))
+    (plan,) = describe_simulated(scenario, signals.read_signals(network, read_net_xml(network)))
     assert plan["source"] == "assumed"
     assert all(count.per_hour == round(count.per_hour) > 0 for count in scenario.traffic.counts)
     assert any("traffic" in entry for entry in scenario.assumed)
@@ -219,7 +219,7 @@ def test_edited_tables_are_used_and_stay(made_scenario: Path, tmp_path: Path, ru
     assert scenario.traffic.counts[1:] == load(made_scenario).traffic.counts[1:]
     network = tmp_path / "made" / "network.net.xml"
     apply_plans(scenario, network, network)
-    (plan,) = describe_simulated(scenario, network, read_net_xml(network))
+    (plan,) = describe_simulated(scenario, signals.read_signals(network, read_net_xml(network)))
     assert (plan["source"], plan["cycle_s"]) == ("signals.csv", 2 * (17 + 5))
     with pytest.raises(InputError, match="not empty"):
         create_scenario(tmp_path / "made", tmp_path / "map.osm", righthand=True)

@@ -251,7 +251,7 @@ TIMES_AND_SIZES = (
         tracks,
         key("traffic.track_columns", {**scenes.TRACK_COLUMNS, "time_unit": "ms"}),
         "tracks",
-        "or times are wrong",
+        "seconds in a column of milliseconds give this",
         extension="tracks",
     ),
     Case("weight of a period below zero", periods, period(1, weight=-1), "traffic.periods.1.weight", "got -1"),

@@ -167,7 +167,7 @@ def check(
         typer.Option("--verbose", help="Print all poles, and what protects this machine from the scenario's files."),
     ] = False,
 ) -> None:
-    """Check a scenario before a run: print where the poles stand, all errors and warnings. No files are written."""
+    """Check a scenario before a run: print poles, signal plans, all errors and warnings. No files are written."""
     from egvs.cli import run_tables
     from egvs.core import sandbox
     from egvs.runs.run_sources import SettingsSource
@@ -178,6 +178,7 @@ def check(
     run_tables.print_check(checked, with_details=verbose)
     if not checked.errors:
         run_tables.print_mounts(loaded)
+        run_tables.print_signals(loaded)
     if verbose:
         run_tables.print_protections(sandbox.missing_protections())
     if checked.errors:

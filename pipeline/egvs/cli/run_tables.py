@@ -36,7 +36,6 @@ from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pol
 from egvs.scenario.score_config import ALL_DETECTORS, DEFAULT_SCORE, NOTICED
 from egvs.sensors.return_model import NEGLIGIBLE_LOSS, ReturnModel
 from egvs.sensors.sensor import FEW_BEAMS, FEW_BEAMS_HINT, describe_few_beams
-from egvs.traffic.signal_descriptions import format_plan
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
@@ -323,8 +322,6 @@ def print_check(checked: CheckReport, *, with_details: bool = False) -> None:
         if hidden := len(checked.poles) - len(shown):
             out.print(f"{hidden} more poles; --verbose lists them")
         out.print("kerb: distance to the edge of the carriageway; wall: to the nearest building or other surface")
-    for plan in checked.signals:
-        out.print(format_plan(plan))
     for severity, findings in (("error", checked.errors), ("warning", checked.warnings), ("note", checked.notes)):
         if not findings:
             continue
@@ -338,6 +335,20 @@ def print_check(checked: CheckReport, *, with_details: bool = False) -> None:
     if not (checked.errors or checked.warnings):
         out.print("no errors or warnings")
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
+
+
+def print_signals(scenario: Scenario) -> None:
+    """Print the plans of the signals in the region, as they will be simulated; nothing where traffic is recorded."""
+    from egvs.traffic import sumo_folder
+    from egvs.traffic.signal_descriptions import describe_simulated, format_plan
+    from egvs.traffic.signal_plans import planned_signals
+
+    first = next(iter(scenario.by_period().values()))
+    path, roads = sumo_folder.network_path(first), sumo_folder.read_network(first)
+    if path is None or roads is None or not roads.stop_lines or first.traffic.is_finished:
+        return
+    for plan in describe_simulated(first, planned_signals(first, path, roads)):
+        console(_RESULT_FILE_WIDTH).print(format_plan(plan))
 
 
 def print_mounts(scenario: Scenario) -> None:

@@ -89,9 +89,6 @@ class CheckReport:
         How many were checked.
     poles
         Where each pole stands, from :func:`check_scenario`.
-    signals
-        The plans of the signals in the region, from :func:`check_scenario`; each as in
-        :func:`egvs.traffic.signal_descriptions.describe_signals`.
     """
 
     findings: tuple[Diagnostic, ...]
@@ -99,7 +96,6 @@ class CheckReport:
     solids: int
     lanes: int
     poles: tuple[PoleSurroundings, ...] = ()
-    signals: tuple[Mapping[str, Any], ...] = ()
 
     @property
     def errors(self) -> tuple[Diagnostic, ...]:
@@ -148,14 +144,13 @@ class SceneReport:
 
 
 def check_scenario(scenario: Scenario) -> CheckReport:
-    """Apply every rule to a scenario, see :func:`check_inputs`, and describe its poles and its signal plans."""
+    """Apply every rule to a scenario, see :func:`check_inputs`, and describe where each pole stands."""
     inputs = Inputs(scenario)
     report = check_inputs(inputs)
     if report.errors:
         return report
     readable, _ = stage_inputs.resolve_check_inputs(inputs)
-    signals = tuple(traffic_checks.signal_plans(readable))
-    return replace(report, poles=scene_checks.pole_surroundings(readable), signals=signals)
+    return replace(report, poles=scene_checks.pole_surroundings(readable))
 
 
 def check_inputs(inputs: Inputs, scene: SceneReport | None = None) -> CheckReport:

@@ -46,6 +46,7 @@ from egvs.traffic import (
 )
 from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.locks import WatchedRegion
+from egvs.traffic.signals import read_signals
 from egvs.traffic.vehicle_boxes import TrafficHook
 from egvs.world import geolocation
 
@@ -191,7 +192,7 @@ def _signal_plans(context: StageContext) -> list[dict[str, Any]]:
     roads = network.read_net_xml(paths[0])
     if not roads.stop_lines:
         return []
-    return signal_descriptions.describe_simulated(scenario, paths[0], roads)
+    return signal_descriptions.describe_simulated(scenario, read_signals(paths[0], roads))
 
 
 def _record_period(

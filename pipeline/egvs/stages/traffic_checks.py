@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -28,7 +27,6 @@ from egvs.traffic import (
     network,
     recording,
     road_check,
-    signal_descriptions,
     sumo_folder,
     traffic_sources,
     user_files,
@@ -183,16 +181,6 @@ def check_internal_edges(inputs: CheckInputs) -> Iterator[Diagnostic]:
     if path is not None and roads is not None and roads.lacks_internal_edges:
         finding = Diagnostic.of("traffic", network.no_internal_edges_error(path, path))
         yield replace(finding, is_error=not scenario.traffic.is_finished)
-
-
-def signal_plans(inputs: CheckInputs) -> list[dict[str, Any]]:
-    """Return the plans of the signals in the region that will be simulated; the scenario has no errors."""
-    scenario = next(iter(inputs.scenario.by_period().values()))
-    path = sumo_folder.network_path(scenario)
-    if scenario.traffic.is_finished or path is None:
-        return []
-    roads = network.read_net_xml(path)
-    return signal_descriptions.describe_planned(scenario, path, roads) if roads.stop_lines else []
 
 
 @_for_each_period

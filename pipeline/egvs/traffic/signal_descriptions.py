@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from egvs.core.grid import Roi
 from egvs.core.wording import shorten_id
 from egvs.scenario.model import Scenario
-from egvs.traffic import network
 from egvs.traffic.assumed_plans import is_assumed
 from egvs.traffic.directions import CLOCKWISE, COMPASS
-from egvs.traffic.signal_plans import find_signal, planned_signals
+from egvs.traffic.signal_plans import find_signal
 from egvs.traffic.signals import (
     CROSSING,
     GREEN_LETTERS,
@@ -21,7 +19,6 @@ from egvs.traffic.signals import (
     Link,
     Program,
     Signal,
-    read_signals,
 )
 
 ASSUMED_SOURCE = "assumed"
@@ -32,17 +29,8 @@ _MAX_PHASES = 100
 """A program with more phases replays a recording; it is not described phase by phase."""
 
 
-def describe_simulated(scenario: Scenario, path: Path, roads: network.Network) -> list[dict[str, Any]]:
-    """Return :func:`describe_signals` for the network that was simulated; parameters as in :func:`apply_plans`."""
-    return _describe(scenario, read_signals(path, roads))
-
-
-def describe_planned(scenario: Scenario, path: Path, roads: network.Network) -> list[dict[str, Any]]:
-    """Return :func:`describe_signals` for the network of a scenario, with its plans; parameters as above."""
-    return _describe(scenario, planned_signals(scenario, path, roads))
-
-
-def _describe(scenario: Scenario, found: Sequence[Signal]) -> list[dict[str, Any]]:
+def describe_simulated(scenario: Scenario, found: Sequence[Signal]) -> list[dict[str, Any]]:
+    """Return :func:`describe_signals` for the signals of a network with the plans of a scenario."""
     planned = {}
     for name, config in scenario.traffic.signals.items():
         signal = find_signal(name, found, f"{scenario.file}: traffic.signals.{name}")

@@ -98,7 +98,7 @@ def test_intervals_and_marks_are_in_the_scenario(tmp_path: Path, network_path: P
     assert "(3 vehicles only; enter your own count)" in text
     assert "speedFactor mean 95 %: " in text
     assert "SUMO's default, since fewer than 20 vehicles show another value: speedFactor (3)" in text
-    assert "# [[traffic.periods]]" in text
+    assert "# For peaks, add tables [[traffic.periods]]" in text
     scenario = egvs.load(tmp_path / "new")
     assert scenario.traffic.tracks is None
     assert "counts of 1 of 2 movements (with fewer than 20 recorded vehicles)" in scenario.assumed
