@@ -639,6 +639,7 @@ def test_level_is_that_of_the_detectors_own_model(tmp_path: Path) -> None:
         calibration.level(lacking, ["cluster"], VARIANTS[0])
 
 
+@pytest.mark.slow
 @pytest.mark.system  # draws with matplotlib
 def test_reliability_of_made_up_vehicles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def changed() -> None:
@@ -721,6 +722,7 @@ def test_orders_by_sensor_and_height_are_those_of_the_training_junctions() -> No
     assert tables.TrainedBaselines([training], ["one"]).of(training, "one") == {}
 
 
+@pytest.mark.slow
 def test_tables_are_the_same_each_time(made_up: Path, tmp_path: Path) -> None:
     write_tables(made_up, tmp_path / "one")
     write_tables(made_up, tmp_path / "two")
@@ -769,6 +771,7 @@ def write_rows(
         write_table(folder / f"{name}.{detector}.hits.parquet", {"site": site, "row": row, "hits": hits})
 
 
+@pytest.mark.slow
 @pytest.mark.system  # scikit-learn asks the system for its cores
 def test_models_are_fitted_to_training_records(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

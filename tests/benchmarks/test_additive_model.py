@@ -48,6 +48,7 @@ def test_probability_by_hand():
     )
 
 
+@pytest.mark.slow
 def test_features_by_hand():
     visible = seen([frame([car(21.0, 0.0)], ("bus",))], fan())
     x = target_features(visible)

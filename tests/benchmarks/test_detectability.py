@@ -113,6 +113,7 @@ def test_a_planted_dependence_is_found_and_holds_elsewhere() -> None:
     assert sum(part["vehicle_frames"] * abs(part["chance"] - part["found"]) for part in parts) < 0.03 * count
 
 
+@pytest.mark.slow
 def test_vehicles_without_points_and_busy_junctions_do_not_change_a_model() -> None:
     """Those without points have probability 0 in the program; ten times as much of the same traffic counts as one."""
     first, second = random_detections(1), random_detections(2)
@@ -167,6 +168,7 @@ def test_the_shipped_models_are_of_the_detectors_that_are_shipped() -> None:
     assert shipped == {name: files.hash_json(study_detectors.make(name).settings) for name in MODELLED}
 
 
+@pytest.mark.slow
 def test_the_picture_shows_every_part_of_the_curves(tmp_path: Path) -> None:
     shipped = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
     above, below = figures.calibration(shipped).axes

@@ -135,6 +135,7 @@ def test_vehicles_that_could_not_start_are_a_caveat_of_answer_report_and_plan(
     assert careful in " ".join(run_egvs("place", mini, "--out", tmp_path / "out", "--count", "1")[1].split())
 
 
+@pytest.mark.slow
 def test_plans_in_one_go(six_poles: Path, tmp_path: Path, run_egvs) -> None:
     out = tmp_path / "out"
     code, printed, error = run_egvs("run", six_poles, "--out", out, "--count", "2")
@@ -187,6 +188,7 @@ def test_existing_poles_are_no_assumption_and_missing_surroundings_are(mini: Pat
     assert sections.assumptions(bare, ())[2:] == ("surroundings (no building or tree is known)",)
 
 
+@pytest.mark.slow
 def test_says_that_losses_of_several_sensors_are_off_where_they_are(mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\na,10,12,5,VLP-16\nb,30.5,-12,5,VLP-32C\n")
     scenario = mini / "scenario.toml"

@@ -50,6 +50,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             del sys.modules[name]
 
 
+@pytest.mark.slow
 def test_command_of_extension_runs_and_is_listed_in_its_panel(site: Path, run_egvs: Any) -> None:
     install(site, "greetings", "greetings = plug_greet:COMMANDS", {"plug_greet": MODULE}, commands.GROUP)
     assert run_egvs("greet", "you")[:2] == (0, "hello you\n")

@@ -119,6 +119,7 @@ def test_a_file_that_may_not_be_read_is_wrong_input(mini: Path, tmp_path: Path, 
     assert last_line.startswith("egvs: ") and str(mini) in last_line and "Permission denied" in last_line
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_folder_that_may_not_be_entered_is_wrong_input(mini: Path, tmp_path: Path) -> None:
     mini.chmod(0o400)

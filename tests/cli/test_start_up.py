@@ -50,6 +50,7 @@ def heavy(modules: set[str]) -> set[str]:
     return HEAVY & {name.partition(".")[0] for name in modules}
 
 
+@pytest.mark.slow
 def test_help_imports_no_library_of_arrays_or_models() -> None:
     printed, modules = imported_modules("--help")
     assert "Rank candidate sites" in printed
@@ -57,6 +58,7 @@ def test_help_imports_no_library_of_arrays_or_models() -> None:
     assert not (OF_RESULTS | {"pydantic"}) & modules
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [("run", "--help"), ("place", "--help")])
 def test_help_of_a_command_imports_no_library_of_arrays(words: tuple[str, ...]) -> None:
     _, modules = imported_modules(*words)

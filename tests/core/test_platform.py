@@ -54,6 +54,7 @@ def test_relative_paths_have_slashes_and_may_be_on_another_drive(monkeypatch: py
     assert platform.relative_path(PureWindowsPath(r"D:\towns\a"), PureWindowsPath(r"C:\runs")) == "D:/towns/a"
 
 
+@pytest.mark.slow
 def test_peak_memory_grows_with_an_array() -> None:
     before_mb = platform.peak_memory_mb()
     size_mb = int(before_mb) + 100

@@ -150,6 +150,7 @@ def is_lefthand(folder: Path) -> bool:
     return 'lefthand="true"' in (folder / "network.net.xml").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_map_of_england_gets_left_hand_traffic(tmp_path: Path) -> None:
     path = ring_map(tmp_path / "england.osm", 52.5, -1.5, clockwise=True)
     made = create_scenario(tmp_path / "made", path)
@@ -163,6 +164,7 @@ def test_map_of_england_gets_left_hand_traffic(tmp_path: Path) -> None:
         create_scenario(tmp_path / "other", path, lefthand=True, righthand=True)
 
 
+@pytest.mark.slow
 def test_ring_that_contradicts_the_country_stops_until_the_side_is_stated(tmp_path: Path) -> None:
     path = ring_map(tmp_path / "map.osm", 52.0, 10.0, clockwise=True)
     with pytest.raises(InputError, match=r"map\.osm: the side of traffic is unclear: .* Add --lefthand or --righthand"):

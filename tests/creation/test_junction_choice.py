@@ -40,6 +40,7 @@ def create(folder: Path, at_m: XY | None, signals: bool = True) -> NewScenario:
     return create_scenario(folder / "out", osm, at)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("at_m", "title"),
     [
@@ -83,6 +84,7 @@ def test_point_far_from_all_junctions_is_an_error_that_names_the_nearest(tmp_pat
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_point_far_from_all_junctions_ends_the_program_with_2(tmp_path: Path, run_egvs) -> None:
     osm = write_map(tmp_path / "map.osm", NODES, WAYS, SIGNALS)
     lat_deg, lon_deg = degrees((180.0, 100.0))
@@ -90,6 +92,7 @@ def test_point_far_from_all_junctions_ends_the_program_with_2(tmp_path: Path, ru
     assert code == 2 and "--at: no junction of 3 or more roads" in error
 
 
+@pytest.mark.slow
 def test_poles_are_spread_over_the_arms_of_a_fork(tmp_path: Path) -> None:
     """Two arms leave eastwards with an angle of 50 degrees between them, a third one westwards."""
     nodes = {1: (-300.0, 0.0), 2: (0.0, 0.0), 3: (270.0, 126.0), 4: (270.0, -126.0)}
@@ -141,6 +144,7 @@ def test_carriageways_of_divided_roads_are_one_arm_each(tmp_path: Path) -> None:
     assert (summary.junction.arms, summary.junction.lanes_in) == (4, 4)
 
 
+@pytest.mark.slow
 def test_lane_for_turning_belongs_to_the_arm_of_its_road(tmp_path: Path) -> None:
     """Main Street has a lane of its own for right turns, from 90 m before the junction on; Lane meets it beside it."""
     nodes = {1: (-300.0, 0.0), 2: (-90.0, 0.0), 3: (-60.0, -6.0), 4: (-20.0, -6.0), 5: (0.0, 0.0), 6: (300.0, 0.0)}
@@ -166,6 +170,7 @@ def test_road_that_becomes_divided_is_no_junction(tmp_path: Path) -> None:
     assert not summary.region.other_junctions
 
 
+@pytest.mark.slow
 def test_next_junctions_are_listed_with_the_option_that_chooses_them(tmp_path: Path) -> None:
     summary = create(tmp_path, None)
     (other,) = summary.region.other_junctions
@@ -177,6 +182,7 @@ def test_next_junctions_are_listed_with_the_option_that_chooses_them(tmp_path: P
     assert not again.region.other_junctions
 
 
+@pytest.mark.slow
 def test_second_carriageway_is_no_further_junction(tmp_path: Path) -> None:
     """B Street meets both carriageways of A Street, 30 m apart; there are signals at both, and at a stop line."""
     nodes = {1: (-300.0, 0.0), 2: (0.0, 0.0), 3: (300.0, 0.0), 4: (300.0, 30.0), 5: (0.0, 30.0), 6: (-300.0, 30.0)}
@@ -193,6 +199,7 @@ def test_second_carriageway_is_no_further_junction(tmp_path: Path) -> None:
     assert describe_streets(summary.streets).endswith(", 1 junction with signals")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("access", ["road", "carriageways", "none"])
 def test_network_with_at_most_one_end_has_traffic_through_the_junction(tmp_path: Path, access: str) -> None:
     """A block of streets with a cross in its middle: 4 approaches with 3 turns each, with or without an access road."""

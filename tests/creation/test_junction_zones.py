@@ -24,6 +24,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[Zone, ..
     return folder, create_scenario(folder, SMALL, walk=True).region.zones
 
 
+@pytest.mark.slow
 def test_crossroads_has_a_zone_of_each_kind_on_each_side(made: tuple[Path, tuple[Zone, ...]]) -> None:
     names = {zone.name for zone in made[1]}
     for side, street in (("north", "North"), ("east", "East"), ("south", "North"), ("west", "East")):
@@ -64,6 +65,7 @@ def test_file_of_the_scenario_has_the_zones(made: tuple[Path, tuple[Zone, ...]])
     assert document["features"][0]["properties"] == {"name": "conflict area", "kind": "conflict area"}
 
 
+@pytest.mark.slow
 def test_roundabout_has_its_ring_as_conflict_area(tmp_path: Path) -> None:
     made = create_scenario(tmp_path / "made", ROUNDABOUT)
     area = {zone.name: zone.area for zone in made.region.zones}

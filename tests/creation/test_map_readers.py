@@ -43,6 +43,7 @@ def test_folder_stands_for_its_maps(tmp_path: Path) -> None:
     assert map_readers.list_files([tmp_path]) == [tmp_path / "roads.net.xml"]
 
 
+@pytest.mark.slow
 def test_archive_stands_for_its_maps(tmp_path: Path, run_egvs) -> None:
     path = tmp_path / "maps.zip"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -150,6 +151,7 @@ def test_unusable_network_names_the_map_and_no_temporary_file(tmp_path: Path) ->
     assert "network.net.xml" not in message
 
 
+@pytest.mark.slow
 def test_street_of_a_thousand_kilometres_names_the_extract(tmp_path: Path) -> None:
     osm = tmp_path / "long.osm"
     text, far = SMALL.read_text(encoding="utf-8"), 'id="104" lat="52.0017975" lon="-10"'
@@ -160,6 +162,7 @@ def test_street_of_a_thousand_kilometres_names_the_extract(tmp_path: Path) -> No
     assert str(caught.value).startswith(f"{osm}: the network cannot be used: lane ")
 
 
+@pytest.mark.slow
 def test_signal_that_cannot_be_read_names_the_network(tmp_path: Path) -> None:
     create_scenario(tmp_path / "made", SMALL)
     text = (tmp_path / "made" / "network.net.xml").read_text(encoding="utf-8")

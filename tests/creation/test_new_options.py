@@ -71,6 +71,7 @@ def write_all_solids(folder: Path, extract: Path) -> None:
 
 
 # --- solids out of range -------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_solids_beyond_sensor_range_are_left_out_with_a_note(tmp_path: Path) -> None:
     plain = create_scenario(tmp_path / "plain", SMALL)
     summary = create_scenario(tmp_path / "far", with_far_objects(tmp_path))
@@ -113,6 +114,7 @@ def print_new(summary: NewScenario, capsys: pytest.CaptureFixture[str]) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow
 def test_distance_from_requested_position_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     near = create_scenario(tmp_path / "near", SMALL, at=(52.0003, 10.0))
     assert near.region.from_at_m == pytest.approx(33.4 - junction_half_depth_m(near), abs=0.5)
@@ -130,6 +132,7 @@ def junction_half_depth_m(summary: NewScenario) -> float:
     return summary.junction.area.bounds[3] - summary.junction.at_m[1]
 
 
+@pytest.mark.slow
 def test_junction_far_from_requested_position_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     far = create_scenario(tmp_path / "far", SMALL, at=(52.0008, 10.0))
     from_at_m = far.region.from_at_m
@@ -141,6 +144,7 @@ def test_junction_far_from_requested_position_is_a_warning(tmp_path: Path, capsy
 
 
 # --- poles every N metres ------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_poles_at_a_spacing_cover_all_kerbs(tmp_path: Path) -> None:
     default = create_scenario(tmp_path / "default", SMALL)
     dense = create_scenario(tmp_path / "dense", SMALL, pole_spacing_m=10.0)
@@ -180,6 +184,7 @@ def with_poles(folder: Path, **tags_at_m: tuple[str, float, float]) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [1, -1], ids=["right", "left"])
 def test_poles_of_the_map_are_candidates(tmp_path: Path, side: int) -> None:
     lamp = "highway=street_lamp"
@@ -220,6 +225,7 @@ def test_poles_of_the_map_are_candidates(tmp_path: Path, side: int) -> None:
     assert any("less than 1 m from another one" in note for note in made.notes)
 
 
+@pytest.mark.slow
 def test_map_without_poles_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^--poles existing: no map has a street lamp, signal mast or utility pole"):
         create_scenario(tmp_path / "out", with_poles(tmp_path), existing_poles=True)
@@ -234,6 +240,7 @@ def test_rejects_spacing_of_poles(tmp_path: Path, spacing_m: float) -> None:
 
 
 # --- demand --------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("total_per_h", [7, 600, 2001])
 def test_requested_vehicles_per_hour_are_written(tmp_path: Path, total_per_h: int) -> None:
     summary = create_scenario(tmp_path / "out", SMALL, traffic=total_per_h)
@@ -246,6 +253,7 @@ def test_requested_vehicles_per_hour_are_written(tmp_path: Path, total_per_h: in
     assert not any("traffic" in entry for entry in assumed)
 
 
+@pytest.mark.slow
 def test_requested_vehicles_per_hour_above_capacity_stay_and_are_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -271,6 +279,7 @@ def test_rejects_number_of_vehicles_per_hour(tmp_path: Path, per_h: int) -> None
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_command_line_takes_poles_and_demand(tmp_path: Path, run_egvs) -> None:
     folder = tmp_path / "made"
     code, printed, _ = run_egvs(
@@ -295,6 +304,7 @@ def test_command_line_rejects_options(tmp_path: Path, run_egvs, options: tuple[o
     assert not (tmp_path / "made").exists()
 
 
+@pytest.mark.slow
 def test_plans_of_a_new_scenario_have_one_sensor_per_pole(tmp_path: Path) -> None:
     create_scenario(tmp_path / "out", SMALL)
     assert loading.load(tmp_path / "out").placement.most_per_pole == 1

@@ -71,6 +71,7 @@ def collect(*maps: MapFile, zero_height_m: float | None = None, **options: Any) 
     return static_objects.collect_objects(read, roads.streets, (0.0, 0.0), zero_height_m, **options)
 
 
+@pytest.mark.slow
 def test_sumo_network_is_used_as_it_is(tmp_path: Path) -> None:
     made = create_scenario(tmp_path / "made", ROUNDABOUT)
     text = ROUNDABOUT.read_text(encoding="utf-8")
@@ -83,6 +84,7 @@ def test_sumo_network_is_used_as_it_is(tmp_path: Path) -> None:
     assert len(made.flows) == 12
 
 
+@pytest.mark.slow
 def test_region_and_sites_follow_the_hill(tmp_path: Path) -> None:
     """The junction is 8 m high and level; the main road climbs at 4 % from 20 m beside its middle, on both sides."""
     create_scenario(tmp_path / "made", HILL)
@@ -108,6 +110,7 @@ def test_network_has_its_own_side_and_sidewalks(tmp_path: Path, option: str) -> 
     assert not (tmp_path / "made").exists()
 
 
+@pytest.mark.slow
 def test_network_is_cut_on_request(tmp_path: Path) -> None:
     """What is left in the square is within a centimetre of where it was; the junction and its region are the same."""
     grid = netgenerate(tmp_path / "map", "--grid", "--grid.number", "4", "--grid.length", "120", name="grid.net.xml")
@@ -226,6 +229,7 @@ def test_footprint_is_cut_at_the_carriageway() -> None:
     assert sum(part.area.area for part in objects.solids) < solid.area.area
 
 
+@pytest.mark.slow
 def test_building_of_another_map_replaces_that_of_openstreetmap(tmp_path: Path) -> None:
     small = Path(__file__).parent / "data" / "small.osm"
     plain = create_scenario(tmp_path / "plain", small)
@@ -283,6 +287,7 @@ def write_terrain(path: Path, rise_east: float) -> Path:
     return path
 
 
+@pytest.mark.slow
 @needs("maps")
 def test_roads_buildings_and_sites_follow_a_terrain(tmp_path: Path) -> None:
     """On a plane that rises by 4 % to the east, heights differ by 4 % of the differences of x."""
@@ -333,6 +338,7 @@ def test_point_cloud_replaces_what_it_contains() -> None:
     assert rest.counts.objects == {"barrier": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_network_that_sumo_rejects_is_named(tmp_path: Path, run_egvs) -> None:
     network = tmp_path / "roads.net.xml"
@@ -346,6 +352,7 @@ def test_network_that_sumo_rejects_is_named(tmp_path: Path, run_egvs) -> None:
     assert not (tmp_path / "made").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @needs("maps")
 def test_maps_that_cover_all_kerbs_are_named(tmp_path: Path) -> None:
@@ -392,6 +399,7 @@ def test_slope_surface_model_and_mesh_in_one_scenario(tmp_path: Path, run_egvs) 
     assert f"{solids[1]} solids" in checked
 
 
+@pytest.mark.slow
 @needs("maps")
 def test_mesh_in_feet_is_converted_to_metres(tmp_path: Path, run_egvs) -> None:
     """A shed of 20 feet beside the junction; the points of --align are 328.08 feet apart."""
@@ -409,6 +417,7 @@ def test_mesh_in_feet_is_converted_to_metres(tmp_path: Path, run_egvs) -> None:
     )  # turned from true north to the grid's
 
 
+@pytest.mark.slow
 def test_lists_junctions_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs) -> None:
     monkeypatch.chdir(tmp_path)
     code, printed, progress = run_egvs("new", "--from", SMALL, "--list")
@@ -427,6 +436,7 @@ def test_lists_junctions_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.
     assert (code, "place: there is no such map, and --list makes no folder" in message) == (2, True)
 
 
+@pytest.mark.slow
 def test_lists_the_nearest_junctions_of_a_point_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs
 ) -> None:
@@ -459,6 +469,7 @@ def write_crossroads(path: Path, lons_deg: list[float]) -> None:
     path.write_text(f'<osm version="0.6">{"".join(lines)}</osm>', encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_roads_without_buildings_and_trees_assume_open_surroundings(tmp_path: Path) -> None:
     roads = SMALL.read_text().replace('k="building', 'k="was_building').replace('v="tree', 'v="former_tree')
     (tmp_path / "roads.osm").write_text(roads)

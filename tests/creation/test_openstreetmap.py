@@ -100,6 +100,7 @@ def edited(tmp_path: Path, *changes: tuple[str, str]) -> Path:
 
 
 # --- what is in the scenario ---------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_heights_by_source(made: Made) -> None:
     heights = made[1].statics.counts.heights
     assert heights["building"] == {"height": 5, "levels": 3, "neighbours": 3}
@@ -300,6 +301,7 @@ def test_names_junction_and_attributes_source(made: Made) -> None:
         assert "(c) OpenStreetMap contributors, ODbL" in (folder / name).read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_special_characters_in_street_name_and_comments(tmp_path: Path) -> None:
     named = edited(tmp_path, ('v="East Street"', 'v="East A\\\\B = #1 &quot;Straße&quot; &amp; more"'))
     title = create_scenario(tmp_path / "named", named).junction.title
@@ -329,11 +331,13 @@ def test_same_bytes_from_other_folder_pbf_and_other_order(made: Made, tmp_path: 
 
 
 # --- variants ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_left_hand_traffic(tmp_path: Path) -> None:
     create_scenario(tmp_path / "left", SMALL, lefthand=True)
     assert 'lefthand="true"' in (tmp_path / "left" / "network.net.xml").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_sidewalks_and_crossings_change_neither_junction_nor_lanes(made: Made, tmp_path: Path) -> None:
     walked = create_scenario(tmp_path / "walked", SMALL, walk=True)
     plain = made[1]
@@ -346,6 +350,7 @@ def test_sidewalks_and_crossings_change_neither_junction_nor_lanes(made: Made, t
     assert ways.crossings > 3 and ways.areas > 3
 
 
+@pytest.mark.slow
 def test_fills_empty_folder_and_repairs_name_with_spaces(tmp_path: Path) -> None:
     folder = tmp_path / "my junction"
     folder.mkdir()
@@ -389,6 +394,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return folder, create_scenario(folder, REAL, surroundings_m=math.inf)
 
 
+@pytest.mark.slow
 def test_real_town(town: Made) -> None:
     folder, summary = town
     assert "Seilerweg" in summary.junction.title and summary.junction.signalised
@@ -413,6 +419,7 @@ def test_real_town_is_in_network_frame(town: Made) -> None:
         assert net.convertLonLat2XY(lon_deg, lat_deg) == pytest.approx(node.getCoord(), abs=0.01)
 
 
+@pytest.mark.slow
 def test_real_town_at_position(town: Made, tmp_path: Path) -> None:
     summary = create_scenario(tmp_path / "other", REAL, at=(50.8704, 9.7080), surroundings_m=math.inf)
     assert summary.junction.title == "signalised junction of Benno-Schilde-Straße and Dippelstraße"
@@ -436,6 +443,7 @@ def test_people_move_in_real_town(town: Made, tmp_path: Path, walk: bool) -> Non
     assert ("pedestrian" in summary["beside_vehicles"]) == walk
 
 
+@pytest.mark.slow
 def test_traffic_of_real_junction_flows(town: Made, tmp_path: Path) -> None:
     from egvs.stages import traffic
 
@@ -556,6 +564,7 @@ def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: 
     assert (loaded.traffic.junction_blocker_s, loaded.traffic.teleport_s) == (10.0, 120.0)
 
 
+@pytest.mark.slow
 def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     jam = TrialRun(1.0, 100, 50, 300.0, 20, "junction 1, Main Street from 20 s on")
     runs = (jam, TrialRun(0.7, 70, 70, 50.0, 0))
@@ -580,6 +589,7 @@ def test_rejects_unknown_level_of_traffic(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_smaller_surroundings_keep_sites_and_flows(tmp_path: Path) -> None:
     made = {r: create_scenario(tmp_path / str(r), SMALL, surroundings_m=r) for r in (120.0, 150.0, math.inf)}
     lengths = [summary.streets.lane_length_m for summary in made.values()]
@@ -603,6 +613,7 @@ def test_rejects_surroundings_smaller_than_junction(tmp_path: Path) -> None:
     assert not (tmp_path / "small").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lefthand", [False, True])
 def test_junction_is_where_the_map_puts_it(tmp_path: Path, lefthand: bool) -> None:
     """netconvert writes a wrong offset of y for left-hand traffic in a given frame."""

@@ -44,6 +44,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 # --- a complete answer -----------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_downloaded_map_gives_the_scenario_of_the_same_file(tmp_path: Path, run_egvs: Any) -> None:
     (tmp_path / "same.osm").write_bytes(ANSWER)
     with overpass_server(send(ANSWER)) as server:

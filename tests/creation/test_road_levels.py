@@ -97,6 +97,7 @@ def decks_of(folder: Path) -> list[dict[str, Any]]:
     return [feature for feature in features if feature["properties"]["kind"] == "bridge"]
 
 
+@pytest.mark.slow
 def test_flyover_is_no_traffic_but_a_deck(tmp_path: Path) -> None:
     path = with_flyover(bridge="yes", layer="1", lanes="4").write(tmp_path / "flyover.osm")
     plain = create_scenario(tmp_path / "plain", SMALL)
@@ -187,6 +188,7 @@ def test_junction_on_a_bridge_loses_the_road_below(tmp_path: Path) -> None:
     assert (ids(others.roads), ids(others.decks)) == ([9002], [])
 
 
+@pytest.mark.slow
 def test_junction_on_a_bridge_becomes_a_scenario(tmp_path: Path) -> None:
     town = with_flyover().tag(1001, bridge="yes", layer="1").tag(1002, bridge="yes", layer="1")
     plain = create_scenario(tmp_path / "plain", SMALL)
@@ -226,6 +228,7 @@ def test_bridges_of_railways_and_paths_are_decks(tmp_path: Path, tags: dict[str,
     assert (ids(others.roads), ids(others.decks)) == ([], decks)
 
 
+@pytest.mark.slow
 def test_pieces_outside_the_region_stay_in_the_network(tmp_path: Path) -> None:
     path = with_flyover(bridge="yes").write(tmp_path / "flyover.osm")
     made = create_scenario(tmp_path / "made", path)

@@ -165,6 +165,7 @@ def test_vehicles_follow_the_flows_around_a_ring(tmp_path: Path) -> None:
     assert not summary["warnings"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("carries_everything")
 def test_real_roundabout_is_one_junction(tmp_path: Path) -> None:
     if not REAL.is_file():

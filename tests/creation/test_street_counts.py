@@ -195,6 +195,7 @@ def test_warns_of_counts_that_lanes_cannot_carry(read: Read) -> None:
 
 
 # --- the scenario ----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_scenario_has_the_counts_as_periods(tmp_path: Path, run_egvs: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: pytest.fail("counts are not reduced"))
     (tmp_path / "c.csv").write_text("approach,turn,start,count\nN,left,07:00,40\nN,left,08:00,80\nS,,08:00,90\n")
@@ -211,6 +212,7 @@ def test_scenario_has_the_counts_as_periods(tmp_path: Path, run_egvs: Any, monke
     assert not [text for text in scenario.assumed if text.startswith("traffic")]
 
 
+@pytest.mark.slow
 def test_counts_of_one_hour_are_no_period(tmp_path: Path, run_egvs: Any) -> None:
     (tmp_path / "c.csv").write_text("approach,turn,count\nN,left,3880\n")
     code, printed, _ = run_egvs("new", tmp_path / "new", "--osm", SMALL, "--counts", tmp_path / "c.csv")

@@ -154,6 +154,7 @@ def test_crossings_keep_positions_of_their_own() -> None:
     assert re.findall(r'linkIndex="(\d+)"', text) == ["0", "1", "2", "3", "0", "1"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason="real maps are not beside the checkout (shared/real)")
 @pytest.mark.parametrize(
     ("name", "at", "lanes_in", "number"),
@@ -190,6 +191,7 @@ def made_scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "made"
 
 
+@pytest.mark.slow
 def test_untouched_tables_change_nothing(made_scenario: Path, tmp_path: Path) -> None:
     """The counts are those that were assumed, and the plan is that of the network."""
     scenario = load(made_scenario)

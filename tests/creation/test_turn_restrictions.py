@@ -400,6 +400,7 @@ def check_random_map(seed: int) -> int:
     return sum("closed" in note or "added" in note for note in made.notes)
 
 
+@pytest.mark.slow
 def test_random_junctions_have_the_turns_of_the_map() -> None:
     assert sum(check_random_map(seed) for seed in range(6))
 

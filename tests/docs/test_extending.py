@@ -114,6 +114,7 @@ def test_an_effect_of_another_package_is_listed_and_checked(mini: Path, tmp_path
     assert code == 2 and "unknown effect" in text, text
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_map_format_of_another_package_is_read(tmp_path: Path) -> None:
     """A wall of 20 m and 2.5 m height beside the junction of the test's extract, and one far away."""

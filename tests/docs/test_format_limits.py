@@ -342,6 +342,7 @@ def test_file_above_a_limit_is_refused(
     assert trial.name in message
 
 
+@pytest.mark.slow
 def test_time_of_a_confined_reader_has_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.laz"
     path.write_bytes(b"x")

@@ -20,6 +20,7 @@ def load_reference() -> ModuleType:
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["columns.md", "limits.md", "modules.md", "scenario-keys.md"])
 def test_page_is_current(name: str) -> None:
     pages = {path.name: (path, text) for path, text in load_reference().pages().items()}

@@ -65,6 +65,7 @@ def all_texts() -> str:
     return "\0".join(program_texts())
 
 
+@pytest.mark.slow
 def test_every_quoted_message_is_in_the_program(all_texts: str) -> None:
     messages = quoted_messages()
     assert len(messages) > 50

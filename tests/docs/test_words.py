@@ -17,6 +17,7 @@ MAX_WORDS = 60_000
 MAX_CHANGELOG_WORDS = 2_500
 
 
+@pytest.mark.slow
 def test_documentation_is_short() -> None:
     counts = words.count_words()
     assert {"index.md", "api/index.md", "notebooks/paper.ipynb"} <= counts.keys()
@@ -29,6 +30,7 @@ def test_changelog_is_short() -> None:
     assert len((ROOT / "CHANGELOG.md").read_text(encoding="utf-8").split()) <= MAX_CHANGELOG_WORDS
 
 
+@pytest.mark.slow
 def test_counts_text_but_no_code_or_output_of_notebooks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(words, "DOCS", tmp_path)
     (tmp_path / "notebooks").mkdir()

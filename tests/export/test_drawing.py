@@ -117,6 +117,7 @@ def test_only_the_view_of_the_best_site_is_switched_on(located: Path, tmp_path: 
     assert sorted(views.values()) == [False, True]
 
 
+@pytest.mark.slow
 @pytest.mark.system  # SUMO drives in this run
 def test_drawing_has_roads_kerbs_buildings_and_plan(on_roads: Path, tmp_path: Path) -> None:
     export_run(on_roads, "dxf", out=tmp_path / "plan.dxf")

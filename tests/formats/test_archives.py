@@ -50,6 +50,7 @@ def test_an_archive_is_a_folder_of_its_files(tmp_path: Path) -> None:
     assert not folder.exists()
 
 
+@pytest.mark.slow
 def test_archives_in_archives_are_folders(tmp_path: Path) -> None:
     def packed(members: Mapping[str, str | bytes]) -> bytes:
         return write_zip(tmp_path / "made", members).read_bytes()
@@ -140,6 +141,7 @@ def test_damaged_and_encrypted_archives(tmp_path: Path) -> None:
             pass
 
 
+@pytest.mark.slow
 @needs_gdal
 def test_kmz_and_zipped_layers(tmp_path: Path) -> None:
     kmz = write_zip(tmp_path / "a.kmz", {"doc.kml": KML, "more/other.kml": KML, "files/icon.png": b"x"})
@@ -158,6 +160,7 @@ def test_kmz_and_zipped_layers(tmp_path: Path) -> None:
         vector_files.read_gis_file(tmp_path / "e.kmz", "Polygon")
 
 
+@pytest.mark.slow
 @needs_gdal
 def test_zipped_shapefile(tmp_path: Path) -> None:
     import pyogrio

@@ -124,6 +124,7 @@ def test_footer_of_parquet_is_read_as_arrow_reads_it(tmp_path: Path, rows: int) 
         assert [(c.name, c.values, c.packed_bytes, c.start) for c in chunks] == expected
 
 
+@pytest.mark.slow
 def test_long_text_in_each_row_is_not_repeated(tmp_path: Path) -> None:
     """A text of 100 kB that a dictionary contains once: 2 GB in 20,000 rows."""
     path = tmp_path / "f.parquet"

@@ -46,6 +46,7 @@ def test_vector_file_of_another_kind_is_rejected(watched: Watched, tmp_path: Pat
     watched.check()
 
 
+@pytest.mark.slow
 def test_only_one_driver_is_left_if_the_signature_is_right(watched: Watched, tmp_path: Path, monkeypatch) -> None:
     """Without the check of signatures, the list of drivers alone rejects a VRT."""
     monkeypatch.setattr("egvs.formats.gdal_layers._check_signature", lambda *_: None)

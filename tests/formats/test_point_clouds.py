@@ -708,6 +708,7 @@ except InputError as error:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_package_adds_a_format(tmp_path: Path) -> None:
     (tmp_path / "site").mkdir()

@@ -26,6 +26,7 @@ from egvs.sensors import sites
 pytestmark = pytest.mark.system
 
 
+@pytest.mark.slow
 def test_rejects_late_duplicate_of_many_keys(tmp_path: Path) -> None:
     """One look at each key: with a count of all names for each name, this takes an hour."""
     path = tmp_path / "a.json"
@@ -67,6 +68,7 @@ def geoparquet(path: Path, rows: int) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_geoparquet_has_the_limit_of_geojson(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A polygon takes 93 bytes, and a feature 100 more."""
     path = geoparquet(tmp_path / "a.parquet", 200_000)

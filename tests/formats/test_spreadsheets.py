@@ -174,6 +174,7 @@ def test_open_document(tmp_path: Path) -> None:
     assert read(path) == [(f"{path}: row 2", {"a": "x", "b": "1.5"})]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_sheet_with_the_expected_header_is_read(tmp_path: Path) -> None:
     def check_header(names: list[str]) -> list[str]:
@@ -304,6 +305,7 @@ def test_rejects_cells_of_open_documents_that_a_reader_cannot_see(
     assert message in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_rejects_hidden_rows_of_excel_97(tmp_path: Path) -> None:
     path = tmp_path / "t.xls"

@@ -90,6 +90,7 @@ def test_sites_are_in_the_world_frame_with_their_columns(located: Path, suffix: 
     assert second.user_columns == {"owner": None, "number": 8}
 
 
+@pytest.mark.slow
 def test_point_heights_and_multipoints_of_one_point_are_sites(located: Path) -> None:
     frame = frame_of({"name": ["a", "b"]}, epsg=25832)
     frame.geometry = [shapely.MultiPoint([shapely.force_3d(point, 6.0)]) for point in frame.geometry]
@@ -112,6 +113,7 @@ def write_kml(path: Path, mode: str = "relativeToGround") -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_kml_altitudes_count_only_above_the_ground(located: Path) -> None:
     write_kml(located / "poles.kml")
     result = candidates(located, "poles.kml")
@@ -135,6 +137,7 @@ def test_columns_of_other_programs_are_rejected_with_the_hint(located: Path, suf
         candidates(located, f"poles.{suffix}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".shp", ".shx", ".dbf"])
 def test_truncated_part_of_shapefile_is_rejected(located: Path, suffix: str) -> None:
     """GDAL alone would read a Shapefile without its last records."""
@@ -149,6 +152,7 @@ def test_truncated_part_of_shapefile_is_rejected(located: Path, suffix: str) -> 
             candidates(located, "poles.shp")
 
 
+@pytest.mark.slow
 def test_shapefile_without_attributes_is_rejected(located: Path) -> None:
     path = write(located / "poles.shp", frame_of({"site": ["a", "b"], "z_m": [3.0, 3.0]}))
     path.with_suffix(".dbf").rename(path.with_suffix(".DBF"))
@@ -169,6 +173,7 @@ def test_pipes_named_like_parts_of_a_file_are_rejected(located: Path, name: str,
         candidates(located, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["gpkg", "parquet"])
 def test_coordinates_that_are_not_finite_give_no_warning(tmp_path: Path, suffix: str) -> None:
     """The readers of features report them, with the number of the feature."""
@@ -180,6 +185,7 @@ def test_coordinates_that_are_not_finite_give_no_warning(tmp_path: Path, suffix:
     assert not np.isfinite(feature["geometry"]["coordinates"]).all()
 
 
+@pytest.mark.slow
 def test_kml_with_a_coordinate_that_is_no_number_gives_no_warning(tmp_path: Path) -> None:
     ring = "<LinearRing><coordinates>10,52,0 10.1,52,0 10.1,nan,0 10,52,0</coordinates></LinearRing>"
     polygon = f"<Polygon><outerBoundaryIs>{ring}</outerBoundaryIs></Polygon>"
@@ -189,6 +195,7 @@ def test_kml_with_a_coordinate_that_is_no_number_gives_no_warning(tmp_path: Path
     assert not np.isfinite(feature["geometry"]["coordinates"]).all()
 
 
+@pytest.mark.slow
 def test_geometries_other_than_points_are_rejected(located: Path) -> None:
     frame = frame_of({"site": ["a", "b"], "z_m": [3.0, 3.0]})
     write(located / "poles.gpkg", frame.set_geometry(frame.to_crs(25832).buffer(2.0).to_crs(4326)))
@@ -196,6 +203,7 @@ def test_geometries_other_than_points_are_rejected(located: Path) -> None:
         candidates(located, "poles.gpkg")
 
 
+@pytest.mark.slow
 def test_layer_of_points_is_used_and_several_are_rejected(located: Path) -> None:
     path = write(located / "all.gpkg", frame_of(ROWS), layer="poles")
     lanes = frame_of({"name": ["x", "y"]})

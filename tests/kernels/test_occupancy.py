@@ -448,6 +448,7 @@ def recorded(tmp_path_factory):
 NUDGES = [sign * 1e-9 * np.eye(8)[axis] for axis in range(3) for sign in (-1, 1)]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_moving_recorded_boxes_by_a_nanometre_keeps_counts(recorded):
     frame, values, grid = recorded

@@ -117,6 +117,7 @@ def test_exact_plan_is_best_of_all_subsets(five_candidates: Path, out: Path, run
         assert [row["count"] for row in curve] == list(range(1, count + 1))
 
 
+@pytest.mark.slow
 def test_plan_of_one_sensor_is_best_site_by_every_score(five_candidates: Path, out: Path) -> None:
     for score in ("egvs", "entropy_seen", "coverage", "expected_visibility", "points_on_target", "seen_well",
                   "expected_detections"):  # fmt: skip
@@ -252,6 +253,7 @@ def test_survives_failure_of_one_sensor(five_candidates: Path, out: Path, run_eg
     assert plan["value"] == curve[-1]["value"] == best == value_after_failure(tuple(row["site"] for row in rows))
 
 
+@pytest.mark.slow
 def test_worst_of_named_periods(five_candidates: Path, out: Path, run_egvs) -> None:
     """The value of one period is its share of the score of all candidates; two periods have at most the lower one."""
     worst = {}
@@ -568,6 +570,7 @@ def test_says_that_time_limit_was_reached(three_candidates: Path, tmp_path: Path
         assert ("--exact reached its --time-limit of 9s" in text) is has_note
 
 
+@pytest.mark.slow
 def test_rule_that_forbids_one_more_is_named(five_candidates: Path, out: Path, run_egvs) -> None:
     """Three candidates at two poles, one sensor for each pole: the explorer recommends no third one either."""
     rules = ("--set", "placement.most_per_pole=1", "--set", "placement.excluded=['c', 'd']")

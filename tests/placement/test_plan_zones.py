@@ -37,6 +37,7 @@ def scenario(mini: Path) -> egvs.Scenario:
     return loading.load(mini, KEYS)
 
 
+@pytest.mark.slow
 def test_plan_finds_what_any_of_its_sensors_finds(
     scenario: egvs.Scenario, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -140,6 +140,7 @@ def test_infeasible_poses_are_counted_and_never_used(mini: Path) -> None:
         assert not house.contains(shapely.Point(sensor.x_m, sensor.y_m))
 
 
+@pytest.mark.slow
 def test_poles_do_not_move_onto_lanes(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two lanes between y = -3.2 and 3.2; the polygon lets the pole move from y = 4.2 to 0."""
     (mini / "net.net.xml").write_text(net_xml())

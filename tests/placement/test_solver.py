@@ -65,6 +65,7 @@ def test_exact_plan_is_best_and_bounds_hold(start: int) -> None:
             assert solution.point.plan_value.value >= (1 - 1 / math.e) * best * (1 - 1e-12), seed
 
 
+@pytest.mark.slow
 def test_smallest_plan_is_smallest() -> None:
     """If it is proved, no subset with one sensor less reaches the share."""
     n_proved = 0
@@ -93,6 +94,7 @@ def test_smallest_plan_is_smallest() -> None:
     assert n_proved > 20
 
 
+@pytest.mark.slow
 def test_bound_holds_when_time_runs_out() -> None:
     for seed in range(60):
         instance = draw_problem(seed)
@@ -133,6 +135,7 @@ def test_degenerate_problems(start: int) -> None:
             assert plan_value.value == best, seed
 
 
+@pytest.mark.slow
 def test_smallest_plan_of_degenerate_problems() -> None:
     for seed in range(100):
         instance = draw_degenerate_problem(seed)

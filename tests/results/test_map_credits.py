@@ -19,6 +19,7 @@ def name_makers(folder: Path, attribution: str) -> None:
     (folder / "statics.geojson").write_text(json.dumps({"attribution": attribution} | statics))
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_report_names_the_makers_of_the_map(mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     assert run_egvs("run", mini, "--out", tmp_path / "plain")[0] == 0

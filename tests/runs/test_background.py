@@ -232,6 +232,7 @@ def without_space(error: BaseException) -> str:
     return re.sub(r"[\d,.]+ MB", "", str(error))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("script", "message"),
     [

@@ -148,6 +148,7 @@ def test_run_does_not_overwrite_foreign_run_record(mini: Path, tmp_path: Path, r
     assert json.loads((tmp_path / "run.json").read_text()) == {"speed_km_h": 12}
 
 
+@pytest.mark.slow
 def test_run_goes_on_in_the_folder_of_a_killed_or_damaged_run(mini: Path, tmp_path: Path) -> None:
     """Artefacts that no record names, and recorded ones that were damaged, are made again."""
     scenario = egvs.load(mini)

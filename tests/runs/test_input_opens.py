@@ -8,6 +8,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from tests.conftest import write_mini
 from tests.processes import python
 
@@ -42,6 +44,7 @@ def count_opens(folder: Path, out: Path, *settings: str) -> dict[str, int]:
     return opens
 
 
+@pytest.mark.slow
 def test_run_with_network_opens_each_input_a_few_times(tmp_path: Path) -> None:
     opens = count_opens(ROUNDABOUT, tmp_path / "run", *SHORT)
     assert opens.keys() >= {"network.net.xml", "sites.csv", "statics.geojson"}
@@ -49,6 +52,7 @@ def test_run_with_network_opens_each_input_a_few_times(tmp_path: Path) -> None:
     assert max(opens.values()) <= 2, opens
 
 
+@pytest.mark.slow
 def test_run_of_finished_file_opens_sites_and_statics_at_most_twice(tmp_path: Path) -> None:
     opens = count_opens(write_mini(tmp_path / "mini"), tmp_path / "run")
     assert opens.keys() >= {"sites.csv", "statics.geojson"}

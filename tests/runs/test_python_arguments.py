@@ -37,6 +37,7 @@ def test_readers_take_files(mini: Path, tmp_path: Path) -> None:
     assert metadata["scenario"]["name"] == "mini"  # as docs/artefacts.md says
 
 
+@pytest.mark.slow
 def test_what_if_result_is_one_line(mini: Path, tmp_path: Path) -> None:
     (mini / "scenario.toml").write_text(
         (mini / "scenario.toml").read_text() + '\n[what_if.works]\nshare = 0.5\nfootprints = ["works.geojson"]\n'

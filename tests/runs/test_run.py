@@ -204,6 +204,7 @@ def test_interrupted_run_records_one_scenario(done: tuple[Path, Path], monkeypat
     assert verification.verify(out) == []
 
 
+@pytest.mark.slow
 def test_scoring_again_casts_nothing(done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     mini, out = done
     casts = []
@@ -315,6 +316,7 @@ def test_rejects_folder_in_place_of_artefact(mini: Path, tmp_path: Path, run_egv
     assert not list((tmp_path / "out").glob(".*.partial"))
 
 
+@pytest.mark.slow
 def test_notebook_lines_of_the_readme_run(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     code = re.search(r"```python\n(.*?)```", text, re.DOTALL)

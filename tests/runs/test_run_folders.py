@@ -362,6 +362,7 @@ def test_folder_with_scenario_and_run_is_a_scenario(here: Path) -> None:
 # ---- what has changed
 
 
+@pytest.mark.slow
 def test_says_in_which_settings_a_scenario_differs_from_its_latest_run(here: Path, run_egvs: Any) -> None:
     def note(*words: object) -> str:
         lines = run_egvs("place", here, "--count", 1, *words)[2].splitlines()
@@ -388,6 +389,7 @@ def test_effect_with_default_parameters_is_on(here: Path, run_egvs: Any) -> None
     assert "mini@moving_occlusion=on: effects.moving_occlusion (on there, off here)\n" in messages
 
 
+@pytest.mark.slow
 def test_latest_run_is_one_of_the_same_scenario(here: Path, tmp_path: Path) -> None:
     from tests.conftest import write_mini
 

@@ -76,6 +76,7 @@ def test_hash_of_a_label_is_the_same_in_every_version() -> None:
     assert settings_label({"sites.sensor": "VLP-16"}) == "sensor=VLP-16,511b6d4c"  # as in docs/artefacts.md
 
 
+@pytest.mark.slow
 @given(SETTINGS, SETTINGS)
 def test_labels_are_equal_exactly_where_settings_are(a: dict[str, Any], b: dict[str, Any]) -> None:
     assert (settings_label(a).lower() == settings_label(b).lower()) == (a == b)

@@ -445,6 +445,7 @@ def outcome(key: str, small: Path, file: str, overrides: tuple[str, ...]) -> obj
     return [stage_keys.stage_key(stage, context).key for stage in STAGES]
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.filter_too_much])
 @given(keys=st.dictionaries(st.sampled_from(sorted(KEYS)), st.booleans(), min_size=1, max_size=8))
 @example({"traffic.signals.*.phases.*.green_s": False})

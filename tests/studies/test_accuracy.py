@@ -37,6 +37,7 @@ def test_thinned_beams_are_reweighted_where_gamma_is_infinite(mini: Path, tmp_pa
     assert error < 0.1
 
 
+@pytest.mark.slow
 def test_study_of_a_finished_file(mini: Path, tmp_path: Path) -> None:
     study = run_study(mini, [], tmp_path / "out", budget_s=300)
     names = [row.setting for row in study.rows]

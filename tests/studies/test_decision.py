@@ -102,6 +102,7 @@ def test_wrong_mount_on_the_best_pole_costs_its_difference() -> None:
     assert quality.loss_points == pytest.approx(6.0, abs=0.2)
 
 
+@pytest.mark.slow
 def test_standard_errors_are_the_scatter_between_studies() -> None:
     losses, errors = [], []
     for seed in range(150):
@@ -112,6 +113,7 @@ def test_standard_errors_are_the_scatter_between_studies() -> None:
     assert 0.7 < np.sqrt(np.mean(np.square(errors))) / np.std(losses) < 2.0
 
 
+@pytest.mark.slow
 def test_model_agrees_with_draws_of_the_same_length() -> None:
     counted, modelled = [], []
     for seed in range(40):

@@ -83,6 +83,7 @@ def test_sensors_are_compared_with_losses_also_where_one_needs_none(mini: Path) 
         assert off.scenario.effects.range_limit is False
 
 
+@pytest.mark.slow
 def test_interval_of_reflectivity_is_part_of_the_error(here: Path, run_egvs) -> None:
     """The difference of two sensors, at both ends of the interval, in the runs that differ in nothing else."""
     assert run_egvs("compare", "mini", "--sensors", "VLP-16,OS1-64")[0] == 0

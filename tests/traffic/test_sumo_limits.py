@@ -32,12 +32,14 @@ def test_idle_sumo_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         sumo.run_program("sumo", [], tmp_path)
 
 
+@pytest.mark.slow
 def test_sumo_that_writes_is_not_idle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_sumo(tmp_path, monkeypatch, "for i in 1 2 3 4 5; do sleep 1; echo >> output; done; echo done")
     monkeypatch.setenv(limits.SUMO_IDLE.name, "3")
     assert sumo.run_program("sumo", [], tmp_path) == "done\n"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not LINUX, reason="elsewhere the launcher is limited, which starts the program")
 def test_sumo_has_a_limit_of_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_sumo(tmp_path, monkeypatch, "while :; do :; done")
@@ -47,6 +49,7 @@ def test_sumo_has_a_limit_of_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         sumo.run_program("sumo", [], tmp_path, time_steps=2)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not LINUX, reason="only Linux limits the memory of a process")
 def test_sumo_has_a_limit_of_memory(town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The real program, with vehicles that wait to depart."""

@@ -325,6 +325,7 @@ def test_warns_about_overlapping_regions(city: City) -> None:
     assert model.load_city(city.folder).name == "town"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_process_cluster")
 def test_junction_with_locked_traffic_is_left_out(city: City, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All others are ranked, and nothing is simulated again."""

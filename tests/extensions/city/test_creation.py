@@ -97,6 +97,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_selects_junctions_with_signals(made: creation.NewCity, extract: Path) -> None:
     city = model.load_city(made.folder)
     assert [j.title for j in city.junctions] == [f"signalised junction of {n} Road and Main" for n in "AB"]
@@ -184,11 +185,13 @@ def connections(net: network.Network) -> set[tuple[str, str, str]]:
     return {(net.edges[c.source].id, net.edges[c.target].id, c.via) for c in net.connections}
 
 
+@pytest.mark.slow
 def test_same_map_gives_same_bytes(made: creation.NewCity, extract: Path, tmp_path: Path) -> None:
     again = creation.create_city(tmp_path / "town", extract)
     assert contents(again.folder) == contents(made.folder)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_city_of_a_zipped_map(made: creation.NewCity, extract: Path, tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "town.zip", "w") as archive:
@@ -198,6 +201,7 @@ def test_city_of_a_zipped_map(made: creation.NewCity, extract: Path, tmp_path: P
     assert not any(str(tmp_path) in note and "town.zip" not in note for note in again.notes)
 
 
+@pytest.mark.slow
 def test_leaves_out_junction_without_pole_locations(extract: Path, tmp_path: Path) -> None:
     city = creation.create_city(tmp_path / "town", extract, NewCityOptions(which="all"))
     assert [new.junction.names[0] for new in city.junctions] == ["A Road", "B Road"]
@@ -285,6 +289,7 @@ def test_traffic_level_is_a_share_of_what_the_network_carries(
         assert model.load_city(folder).traffic.vehicles_per_h == expected
 
 
+@pytest.mark.slow
 def test_from_map_to_scores(extract: Path, tmp_path: Path, run_egvs) -> None:
     code, printed, error = run_egvs("city", "new", tmp_path / "town", "--osm", extract, "--walk")
     assert code == 0, error
@@ -406,6 +411,7 @@ def test_rejects_rows_of_junctions_that_no_line_divides(close_junctions: Path, t
     assert not (tmp_path / "town").exists()
 
 
+@pytest.mark.slow
 def test_city_gets_the_side_and_the_turns_of_the_map(tmp_path: Path) -> None:
     path = ring_map(tmp_path / "england.osm", 52.5, -1.5, clockwise=True)
     city = creation.create_city(tmp_path / "city", path, NewCityOptions(which="all"))

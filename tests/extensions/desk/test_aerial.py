@@ -64,6 +64,7 @@ def middle_of_red(content: bytes, matrix: list[float]) -> list[float]:
     return [a * column + b * row + c, d * column + e * row + f]
 
 
+@pytest.mark.slow
 def test_part_around_the_junction_is_saved(town: Client, tmp_path: Path) -> None:
     before = town.project
     picture = write_picture(tmp_path / "town.tif", *at_junction(tmp_path))
@@ -81,6 +82,7 @@ def test_part_around_the_junction_is_saved(town: Client, tmp_path: Path) -> None
     assert town("GET", "/api/aerial")[0] == 404
 
 
+@pytest.mark.slow
 def test_png_with_a_world_file_lies_in_the_system_of_the_scenario(town: Client, tmp_path: Path) -> None:
     project = town.project
     ((x, y),) = WorldFrame("EPSG:32632").from_lon_lat(np.array([at_junction(tmp_path)])).tolist()
@@ -109,6 +111,7 @@ def huge_png() -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
+@pytest.mark.slow
 def test_other_pictures_are_refused_with_the_reason(town: Client, tmp_path: Path) -> None:
     far = write_picture(tmp_path / "far.tif", 13.4, 52.5).read_bytes()
     nowhere = write_picture(tmp_path / "nowhere.tif", 13.4, 52.5, None).read_bytes()

@@ -27,6 +27,7 @@ def sweep(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_prints_sensor_pose_and_files(sweep: Path, tmp_path: Path, run_egvs: Any) -> None:
     out = tmp_path / "made"
     code, printed, _ = run_egvs("sensor", "fit", str(sweep), "--name", "mast", "--out", str(out))
@@ -44,6 +45,7 @@ def test_prints_sensor_pose_and_files(sweep: Path, tmp_path: Path, run_egvs: Any
     assert "# Sensor mast, fitted by egvs sensor fit to:" in (out / "sensor.toml").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_prints_recording_and_rotation(tmp_path: Path, run_egvs: Any) -> None:
     pytest.importorskip("rosbags")
@@ -118,6 +120,7 @@ def test_defaults_of_recordings_have_one_definition() -> None:
     assert (options["max_sweeps"], options["max_range"]) == (20, 500.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("unit_s", "kind"), [(1e-9, "U"), (1.0, "F")])
 def test_times_of_points_of_a_file_give_the_rotation(tmp_path: Path, run_egvs: Any, unit_s: float, kind: str) -> None:
     """An Ouster's field t counts nanoseconds; others have seconds."""

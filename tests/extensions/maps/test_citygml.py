@@ -65,6 +65,7 @@ def test_house_is_where_it_is_and_as_high_as_it_is(tmp_path: Path) -> None:
     assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(10 * 20 * 12.5)
 
 
+@pytest.mark.slow
 def test_degrees_give_the_same_house(tmp_path: Path) -> None:
     lon_lat = FRAME.to_degrees(np.array([[100.0, 50.0], [110.0, 50.0], [110.0, 70.0], [100.0, 70.0]]))
     ring = [(lat, lon, 3.25) for lon, lat in lon_lat.tolist()]

@@ -27,6 +27,7 @@ WINDOW = box(0, 0, 120, 80)
 CONTEXT = MapContext(FRAME, WINDOW)
 
 
+@pytest.mark.slow
 def test_raster_in_the_projection_of_the_network(tmp_path: Path) -> None:
     terrain = rasters.read_terrain([write_tiff(tmp_path / "a.tif", plane_cells())], CONTEXT)
     xy_m = np.array([[5.0, 5.0], [33.0, 47.0], [114.0, 74.0]])

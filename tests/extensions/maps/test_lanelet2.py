@@ -351,6 +351,7 @@ def test_permissions(tmp_path: Path) -> None:
     assert [road.admits(kind) for kind in kinds] == [True, True, True, False]
 
 
+@pytest.mark.slow
 def test_markings_decide_on_lane_changes(tmp_path: Path) -> None:
     def changes(marking: Mapping[str, str]) -> list[bool]:
         writer = MapWriter()

@@ -104,6 +104,7 @@ def check_lanelet2(path: Path, seed: int) -> None:
         assert note.startswith(f"{len(lost)} turn"), seed
 
 
+@pytest.mark.slow
 def test_random_maps_have_the_turns_of_the_map(tmp_path: Path) -> None:
     for seed in range(3):
         check_opendrive(tmp_path / "map.xodr", seed)

@@ -175,6 +175,7 @@ def test_no_worker_outlives_killed_main_process(mini, tmp_path):
         assert alive.read(1) == b""  # its end was closed with it
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_script_without_main_guard_is_refused(mini, tmp_path):
     """Its worker processes would run the script again, and the main process would wait for them."""

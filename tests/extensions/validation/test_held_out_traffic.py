@@ -63,6 +63,7 @@ def test_frames_of_a_user_demand_stay_in_the_time_of_the_recording(mini):
     assert held_out_traffic.default_spacing_s(scenario, 2) == 7.0
 
 
+@pytest.mark.slow
 def test_spacing_is_an_option_of_validate(run_egvs, mini, tmp_path):
     options = ("--frames", "10", "--detector", "points", "--jobs", "1", "--out", tmp_path / "out")
     code, _, error = run_egvs("validate", mini, *options, "--spacing", "3")
@@ -87,6 +88,7 @@ def test_same_id_in_two_periods_is_two_vehicles(mini, tmp_path):
 
 
 # --- vehicles that the held-out traffic and that of the TPOG have in common ------------------------------------------
+@pytest.mark.slow
 def test_warns_of_the_share_of_vehicles_that_both_have(run_egvs, mini, tmp_path):
     options = ("--frames", "10", "--detector", "points", "--jobs", "1", "--out", tmp_path / "out")
     code, printed, error = run_egvs("validate", mini, *options)

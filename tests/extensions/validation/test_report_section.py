@@ -104,6 +104,7 @@ def test_headline_says_that_the_validation_contradicts_the_ranking(tmp_path):
     assert "contradicts" not in title and "contradicts" not in read.text
 
 
+@pytest.mark.slow
 def test_says_that_a_validation_of_this_run_contradicts_the_ranking(
     mini: Path, tmp_path: Path, run_egvs, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -56,6 +56,7 @@ def validated(tmp_path_factory):
     return mini, folder / "out", done
 
 
+@pytest.mark.slow
 def test_writes_artefacts(validated):
     _, out, done = validated
     assert sorted(path.name for path in out.iterdir() if path.name != ".lock") == sorted(ARTEFACTS)

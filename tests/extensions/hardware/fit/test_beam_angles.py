@@ -45,6 +45,7 @@ def test_clockwise_sweep() -> None:
     assert np.abs(angles.azimuth_offset_deg + OFFSETS_DEG).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_elevations_of_list_with_each_point_alone() -> None:
     points = np.random.default_rng(0).permutation(returns_of(sweep_of(TRUTH)))
     fit = fit_sensor([Sweep("list", points)])
@@ -55,6 +56,7 @@ def test_elevations_of_list_with_each_point_alone() -> None:
     assert fit.angles.direction == 0
 
 
+@pytest.mark.slow
 def test_list_in_order_of_time_gives_direction() -> None:
     points = returns_of(sweep_of(TRUTH))
     assert fit_beam_angles([Sweep("list", points)])[0].direction == 1
@@ -100,6 +102,7 @@ def test_channels_share_offsets_of_one_line() -> None:
         assert np.std(scores) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_second_sweep_narrows_errors() -> None:
     first, second = Sweep("a", sweep_of(TRUTH)), Sweep("b", sweep_of(TRUTH, seed=1))
     one, _ = fit_beam_angles([first])

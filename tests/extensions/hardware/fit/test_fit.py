@@ -176,6 +176,7 @@ def test_chengdu_ground_and_traffic(chengdu: SensorFit) -> None:
     assert np.mean((above > 0.2) & (above < 4.5)) > 0.9  # vehicles stand on the road
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("has_ground", "hint"), [(True, "it was probably levelled"), (False, "neither levelled nor")])
 def test_azimuths_without_a_step_may_be_those_of_a_levelled_sweep(has_ground: bool, hint: str) -> None:
     """Rings at random azimuths, over exactly level ground or within a round wall."""

@@ -40,6 +40,7 @@ def fit(points_m: FloatArray, world: Any, truth: Pose, off_m: tuple[float, float
     return fit_map_pose(points_m, plane(truth), world, (truth.x_m + off_m[0], truth.y_m + off_m[1]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw_deg", [-171.3, 33.0])
 def test_recovers_yaw(yaw_deg: float) -> None:
     """To 0.1 degrees, from a position that is 1.3 m off; the whole chain from the fitted ground plane."""

@@ -84,6 +84,7 @@ def test_no_empty_sector_to_leave_out(tmp_path: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_report_has_standard_errors(tmp_path: Path) -> None:
     output.write_fit(small_fit(), "a", tmp_path)
     config = read_config((tmp_path / "sensor.toml").read_text(encoding="utf-8"), "a")

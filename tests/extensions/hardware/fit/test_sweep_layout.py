@@ -48,6 +48,7 @@ def test_channel_without_returns_is_counted(organised: FloatArray) -> None:
     assert set(layout.channel[4::CHANNELS]) == {3}
 
 
+@pytest.mark.slow
 def test_list_of_returns(organised: FloatArray) -> None:
     rng = np.random.default_rng(5)
     order = rng.permutation(len(organised))
@@ -57,6 +58,7 @@ def test_list_of_returns(organised: FloatArray) -> None:
     np.testing.assert_array_equal(layout.channel, RANK[order % CHANNELS])
 
 
+@pytest.mark.slow
 def test_offset_of_optics_does_not_merge_dense_rings() -> None:
     """Rings 0.125 degrees apart, with optics 60 mm off the axis, which smears the elevation of near points by 0.2."""
     sensor = CATALOGUE["Pandar128"]
@@ -66,6 +68,7 @@ def test_offset_of_optics_does_not_merge_dense_rings() -> None:
     assert not (layout.channel < 0).any()
 
 
+@pytest.mark.slow
 def test_rings_of_beams_off_the_axis() -> None:
     """A list of returns near a sensor whose frame begins 36 mm below its optics, without and with the rings."""
     points, channel = ouster_sweep()
@@ -78,6 +81,7 @@ def test_rings_of_beams_off_the_axis() -> None:
         np.testing.assert_array_equal(layout.channel, expected)
 
 
+@pytest.mark.slow
 def test_list_sorted_by_ring_is_not_organised() -> None:
     """Its rows of equal length are of one elevation each, as in an organised sweep with more channels."""
     points, channel = ouster_sweep()
@@ -100,6 +104,7 @@ def test_rings_of_the_file_keep_columns(organised: FloatArray, order: str) -> No
     assert int(layout.column.max()) == AZIMUTHS - 1
 
 
+@pytest.mark.slow
 def test_ring_field_without_rings_is_not_used(organised: FloatArray) -> None:
     zeros = np.zeros(len(organised), dtype=np.int64)
     layout = find_layout(organised, "sweep", zeros)
@@ -121,6 +126,7 @@ def test_ring_with_few_returns_is_counted() -> None:
     assert set(layout.channel[channel[used] == 7]) == {-1}
 
 
+@pytest.mark.slow
 def test_rejects_cloud_without_rings() -> None:
     points = np.random.default_rng(0).normal(size=(20_000, 3)) * (20.0, 20.0, 5.0)
     with pytest.raises(InputError, match="rings"):

@@ -64,6 +64,7 @@ def failed(result: Acceptance) -> set[str]:
     return {check.name for check in result.checks if not check.passed}
 
 
+@pytest.mark.slow
 def test_sensor_as_planned_is_accepted(installed: InstalledRun) -> None:
     result = accept_points(installed, installed.points(TRAFFIC))
     assert failed(result) == set()
@@ -72,6 +73,7 @@ def test_sensor_as_planned_is_accepted(installed: InstalledRun) -> None:
     assert result.comparison.nearer_share > 0.02  # the traffic
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pitch_deg", "roll_deg"])
 def test_tilt_error_of_one_and_a_half_degrees_is_measured_within_a_tenth(installed: InstalledRun, name: str) -> None:
     pole = pole_at_azimuth(installed.planned, 90.0, 0.8, 0.1)
@@ -84,6 +86,7 @@ def test_tilt_error_of_one_and_a_half_degrees_is_measured_within_a_tenth(install
     assert any(re.match(TILT, reason) for reason in result.reasons)
 
 
+@pytest.mark.slow
 def test_sensor_that_loses_returns_of_the_road_as_planned_is_accepted(tmp_path: Path) -> None:
     """Sweeps of ``egvs clouds``, with losses and traffic, turned from the level frame into the sensor's."""
     folder = write_installed_scenario(tmp_path / "crossing")
@@ -107,6 +110,7 @@ def test_sensor_that_loses_returns_of_the_road_as_planned_is_accepted(tmp_path: 
     assert np.isfinite(comparison.measured_m[near]).mean() < 0.9  # what was expected without losses
 
 
+@pytest.mark.slow
 def test_shift_and_turn_are_measured(installed: InstalledRun) -> None:
     result = accept_points(installed, installed.points(x_m=0.2, z_m=-0.3, yaw_deg=3.0))
     for name, expected in {"x_m": 0.2, "y_m": 0.0, "z_m": -0.3, "yaw_deg": 3.0, "pitch_deg": 0.0}.items():
@@ -115,12 +119,14 @@ def test_shift_and_turn_are_measured(installed: InstalledRun) -> None:
     assert failed(result) == {"position", "yaw"}
 
 
+@pytest.mark.slow
 def test_front_that_points_the_wrong_way_is_reported(installed: InstalledRun) -> None:
     result = accept_points(installed, installed.points(yaw_deg=90.0))
     assert result.pose.values["yaw_deg"] == pytest.approx(90.0, abs=0.1)
     assert "yaw" in failed(result)
 
 
+@pytest.mark.slow
 def test_pole_in_front_of_the_sensor_blocks_the_sector_that_it_covers(installed: InstalledRun) -> None:
     pole = pole_at_azimuth(installed.planned, 90.0, 1.0, 0.15)
     (sector,) = accept_points(installed, installed.points([pole])).comparison.sectors
@@ -132,6 +138,7 @@ def test_pole_in_front_of_the_sensor_blocks_the_sector_that_it_covers(installed:
     assert sector.share > 0.7
 
 
+@pytest.mark.slow
 def test_score_with_obstacle_is_that_of_a_world_with_it(installed: InstalledRun) -> None:
     sites = installed.sites
     site, session = sites.site("pole_a"), sites.session
@@ -150,6 +157,7 @@ def test_score_with_obstacle_is_that_of_a_world_with_it(installed: InstalledRun)
     assert score.as_installed == pytest.approx(expected, abs=0.01)
 
 
+@pytest.mark.slow
 def test_vehicles_do_not_block_but_a_low_obstacle_in_all_scans_does(installed: InstalledRun) -> None:
     container = box((8.0, 6.0, 1.5), (2.5, 2.5, 3.0))
     once = accept_points(installed, installed.points([*TRAFFIC, container])).comparison
@@ -160,6 +168,7 @@ def test_vehicles_do_not_block_but_a_low_obstacle_in_all_scans_does(installed: I
     assert accept_points(installed, *(installed.points(cars, seed=7) for cars in moved)).comparison.sectors == ()
 
 
+@pytest.mark.slow
 def test_channel_without_returns_is_named(installed: InstalledRun) -> None:
     site = installed.sites.site("pole_a")
     elevation = installed.sites.sensor(site).elevations_deg[5]
@@ -168,6 +177,7 @@ def test_channel_without_returns_is_named(installed: InstalledRun) -> None:
     assert failed(result) == {"missing channels"}
 
 
+@pytest.mark.slow
 def test_beams_that_do_not_come_back_are_a_sector_without_returns(installed: InstalledRun) -> None:
     points = installed.points()
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
@@ -178,6 +188,7 @@ def test_beams_that_do_not_come_back_are_a_sector_without_returns(installed: Ins
     assert "without returns" in result.reasons[0]
 
 
+@pytest.mark.slow
 def test_another_sensor_model_is_noticed(installed: InstalledRun) -> None:
     points = installed.points()
     elevation = np.radians(np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=1))))
@@ -186,11 +197,13 @@ def test_another_sensor_model_is_noticed(installed: InstalledRun) -> None:
     assert "returns on no beam" in failed(accept_points(installed, np.concatenate([points, steep])))
 
 
+@pytest.mark.slow
 def test_limits_can_be_switched_off(installed: InstalledRun) -> None:
     points = installed.points(pitch_deg=1.5)
     assert failed(accept_points(installed, points, limits=Limits(tilt_deg=math.inf))) == set()
 
 
+@pytest.mark.slow
 def test_standard_error_of_the_tilt_covers_its_error(installed: InstalledRun) -> None:
     results = [accept_points(installed, installed.points(seed=seed, pitch_deg=0.7)) for seed in range(6)]
     scores = [(result.pose.tilt_deg - 0.7) / result.pose.tilt_se_deg for result in results]
@@ -253,10 +266,12 @@ def test_sensor_that_points_backwards_in_a_symmetric_street_fails_the_yaw() -> N
     assert acceptance._yaw_check(PoseError.of(planned, fit, others), math.inf).passed
 
 
+@pytest.mark.slow
 def test_one_yaw_fits_where_the_walls_differ(installed: InstalledRun) -> None:
     assert accept_points(installed, installed.points(TRAFFIC)).pose.other_yaws_deg == ()
 
 
+@pytest.mark.slow
 def test_fit_at_a_worse_yaw_is_not_taken() -> None:
     """The walls ahead and behind are 8 m and 14 m away: turned around, a scan fits half of the room only."""
     planned, walls = Pose(0.0, 0.0, 4.0, 20.0, 0.0, 0.0), ((-14.0, 8.0), (-10.0, 10.0))
@@ -299,6 +314,7 @@ def test_missing_channel_of_a_sensor_from_a_table_costs_its_beams() -> None:
 # ---- command line
 
 
+@pytest.mark.slow
 def test_command_prints_reason_and_writes_files(installed: InstalledRun, run_egvs: Any, tmp_path: Path) -> None:
     scan = installed.write("tilted.ply", installed.points(TRAFFIC, pitch_deg=1.5))
     words = ("accept", installed.folder, "--site", "pole_a", "--scan", scan, "--out", tmp_path / "out")
@@ -326,6 +342,7 @@ def test_folder_in_use_is_refused_before_anything_is_read(run_egvs: Any, tmp_pat
     assert "another command is using this folder. Repeat egvs accept when it has ended" in errors
 
 
+@pytest.mark.slow
 def test_verdict_is_printed_though_a_command_began_meanwhile(
     installed: InstalledRun, run_egvs: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -406,6 +423,7 @@ def write_street(
     return InstalledRun(folder / "run", folder / "scans")
 
 
+@pytest.mark.slow
 def test_rejects_mirrored_scan_of_a_street_whose_sides_are_almost_alike(tmp_path: Path) -> None:
     """All but one house fit the mirrored scan at the planned pose."""
     street = write_street(tmp_path, ("kiosk", [[18, 4], [24, 4], [24, 8], [18, 8]], 4.0))
@@ -416,12 +434,14 @@ def test_rejects_mirrored_scan_of_a_street_whose_sides_are_almost_alike(tmp_path
         accept_points(street, scan * [1.0, -1.0, 1.0])
 
 
+@pytest.mark.slow
 def test_scan_whose_mirror_image_fits_as_well_gets_a_note(tmp_path: Path) -> None:
     street = write_street(tmp_path)
     for scan in (street.points(), street.points() * [1.0, -1.0, 1.0]):
         assert "the mirror image of the scan fits as well" in " ".join(accept_points(street, scan).notes)
 
 
+@pytest.mark.slow
 def test_rejects_scan_of_another_place(installed: InstalledRun) -> None:
     sites = installed.sites
     here, there = sites.site("pole_a"), sites.site("pole_b")
@@ -432,6 +452,7 @@ def test_rejects_scan_of_another_place(installed: InstalledRun) -> None:
         accept_points(installed, elsewhere)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("turn", "message"),
     [
@@ -446,6 +467,7 @@ def test_names_the_frame_in_which_a_scan_fits(tmp_path: Path, turn: np.ndarray, 
         accept_points(street, street.points() @ turn)
 
 
+@pytest.mark.slow
 def test_says_that_a_scan_was_levelled(tmp_path: Path) -> None:
     """Upright, its pose is found and exactly level; upside down, it is not found in the sensor's frame."""
     kiosk = ("kiosk", [[18, 4], [24, 4], [24, 8], [18, 8]], 4.0)
@@ -463,6 +485,7 @@ def test_says_that_a_scan_was_levelled(tmp_path: Path) -> None:
         accept_points(hung, level)
 
 
+@pytest.mark.slow
 def test_names_the_closest_mount_of_another_pole(tmp_path: Path) -> None:
     start = ("start", [[-40, -9], [-30, -9], [-30, 9], [-40, 9]], 12.0)
     kiosk = ("kiosk", [[22, 3], [27, 3], [27, 7], [22, 7]], 4.0)
@@ -474,6 +497,7 @@ def test_names_the_closest_mount_of_another_pole(tmp_path: Path) -> None:
         accept_points(street, scan)
 
 
+@pytest.mark.slow
 def test_rejects_scan_that_fits_no_site(installed: InstalledRun) -> None:
     sites = installed.sites
     away = replace(sites.site("pole_a").pose, x_m=21.0, y_m=-20.0)
@@ -482,6 +506,7 @@ def test_rejects_scan_that_fits_no_site(installed: InstalledRun) -> None:
         accept_points(installed, nowhere)
 
 
+@pytest.mark.slow
 def test_rejects_scan_of_another_pole_of_a_street_whose_poles_are_almost_alike(tmp_path: Path) -> None:
     """Turned by 180 degrees, all but the kiosk fits here, too."""
     start = ("start", [[-40, -9], [-30, -9], [-30, 9], [-40, 9]], 12.0)
@@ -513,6 +538,7 @@ def test_rejects_unknown_site_and_missing_options(installed: InstalledRun, run_e
         assert (code, message in errors) == (2, True), errors
 
 
+@pytest.mark.slow
 def test_report_shows_the_sheet_and_the_verdict_while_they_belong_to_the_run(installed: InstalledRun) -> None:
     """1.5 degrees of tilt fail; after a run with another gamma, neither is shown."""
     folder = installed.folder.parent / "reported"

@@ -112,6 +112,7 @@ def test_sheet_is_one_page_with_picture_and_map(installed: InstalledRun, tmp_pat
     assert path.read_text().count("data:image/png") >= 2
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_pdf_is_a4_and_the_same_each_time(installed: InstalledRun, tmp_path: Path) -> None:
     pytest.importorskip("cairosvg")
@@ -177,6 +178,7 @@ def sheet_text(path: Path) -> str:
     return " ".join(element.text or "" for element in root.iter("{http://www.w3.org/2000/svg}text"))
 
 
+@pytest.mark.slow
 def test_sheets_of_a_dropped_mast_are_removed(spaced: Path, run_egvs: Any, tmp_path: Path) -> None:
     """A crew that finds an old sheet would mount what is no longer planned. A sheet that somebody changed stays."""
     scenario = spaced.parent / "crossing"
@@ -200,6 +202,7 @@ def test_sheets_of_a_dropped_mast_are_removed(spaced: Path, run_egvs: Any, tmp_p
     egvs.place(egvs.load(scenario, ["placement.count=2", "placement.most_per_pole=1"]), spaced)
 
 
+@pytest.mark.slow
 def test_sheet_in_another_format_or_folder_is_one_more(spaced: Path, run_egvs: Any, tmp_path: Path) -> None:
     scenario = spaced.parent / "crossing"
     places = (spaced / "sheets", "svg"), (spaced / "more", "svg"), (spaced / "more", "pdf")
@@ -213,6 +216,7 @@ def test_sheet_in_another_format_or_folder_is_one_more(spaced: Path, run_egvs: A
     egvs.place(egvs.load(scenario, ["placement.count=2", "placement.most_per_pole=1"]), spaced)
 
 
+@pytest.mark.slow
 def test_sheet_of_a_candidate_is_not_removed_with_those_of_a_plan(spaced: Path, tmp_path: Path) -> None:
     for height in (4, 5):
         sheet.write_sheets(spaced, [f"Mast West@{height}m"], kind="svg", out=tmp_path)

@@ -194,6 +194,7 @@ def test_packets_are_turns(tmp_path: Path) -> None:
     assert np.nanmax(times) == pytest.approx(0.1, abs=0.002)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_fits_packets(tmp_path: Path) -> None:
     """A room of 40 x 48 m, 2 m below: elevations, the known 41.9 mm of the optics, 10 turns per second."""

@@ -92,6 +92,7 @@ def test_no_data_is_no_height_but_only_where_it_counts(tmp_path: Path) -> None:
         assert np.isnan(heights).tolist() == [True, True, False, False, False, False]
 
 
+@pytest.mark.slow
 def test_reads_only_the_part_around_a_rectangle(tmp_path: Path) -> None:
     path = write_tiff(tmp_path / "a.tif", plane_cells(400, 600))
     bounds = (EAST + 1000, NORTH + 1000, EAST + 1100, NORTH + 1200)

@@ -133,6 +133,7 @@ def test_static_classes_are_counted(tmp_path: Path) -> None:
     assert tracks.sources[-1] == "boxes of static classes left out: 1 Trafficcone"
 
 
+@pytest.mark.slow
 def test_500_sweeps(tmp_path: Path) -> None:
     rows = moving_boxes(CLASSES)
     assert_same_boxes(dair_v2x.read(write_dair_v2x(tmp_path, rows)), rows)

@@ -182,11 +182,13 @@ def test_quaternion_of_length_zero_is_no_heading(tmp_path: Path) -> None:
     assert math.isnan(only_box(sweep(tmp_path, {"a": tumtraf_object([1, 2, 0, 0, 0, 0, 0, 4, 2, 1.5])}))[4])
 
 
+@pytest.mark.slow
 def test_500_frames_of_asam(tmp_path: Path) -> None:
     rows = moving_boxes(CLASSES)
     assert_same_boxes(openlabel.read(write_openlabel(tmp_path, rows)), rows)
 
 
+@pytest.mark.slow
 def test_500_sweeps_of_tumtraf(tmp_path: Path) -> None:
     rows = moving_boxes(CLASSES)
     path = write_tumtraf(tmp_path, rows)

@@ -119,6 +119,7 @@ def test_junction_is_that_of_the_tracks(tmp_path: Path) -> None:
     assert egvs.load(tmp_path / "new").traffic.tracks == ("tracks/vehicle_tracks_000.csv",)
 
 
+@pytest.mark.slow
 def test_tracks_in_metres_of_the_map(tmp_path: Path) -> None:
     road_map = write_crossing(tmp_path / "map.osm")
     at_m = create_scenario(tmp_path / "first", road_map).junction.at_m
@@ -129,6 +130,7 @@ def test_tracks_in_metres_of_the_map(tmp_path: Path) -> None:
     assert egvs.load(tmp_path / "new").traffic.track_crs == "world"
 
 
+@pytest.mark.slow
 def test_own_table_of_tracks(run_egvs, tmp_path: Path) -> None:
     road_map = write_crossing(tmp_path / "map.osm")
     at_m = create_scenario(tmp_path / "first", road_map).junction.at_m
@@ -158,6 +160,7 @@ def test_wrong_track_columns_are_reported(run_egvs, tmp_path: Path) -> None:
 PEDESTRIANS = [f"2,{k},{100 * k},pedestrian,{0.1 * k:.3f},5.0,1,0,,," for k in range(101)]
 
 
+@pytest.mark.slow
 def test_tracks_without_vehicles_are_reported(run_egvs, tmp_path: Path) -> None:
     """By a warning when the scenario is made, and as an error before anything is scanned."""
     road_map, new = write_crossing(tmp_path / "map.osm"), tmp_path / "new"
@@ -174,6 +177,7 @@ def test_tracks_without_vehicles_are_reported(run_egvs, tmp_path: Path) -> None:
     assert "the tracks have no vehicle" not in " ".join((out + err).split())
 
 
+@pytest.mark.slow
 def test_misplaced_tracks_are_reported(run_egvs, tmp_path: Path) -> None:
     """The car drives 8 m beside High Street."""
     road_map = write_crossing(tmp_path / "map.osm")

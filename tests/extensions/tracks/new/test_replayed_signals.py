@@ -58,6 +58,7 @@ def simulated_states(network: str, folder: Path, end_s: int) -> list[str]:
     return [element.attrib["state"] for element in ElementTree.parse(folder / "states.xml").iter("tlsState")]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_sumo_shows_the_recorded_states_at_their_time(tmp_path: Path) -> None:
     """Second k of the simulation is second k - 290 of the recording; before second 290, a cycle repeats."""
@@ -80,6 +81,7 @@ def test_sumo_shows_the_recorded_states_at_their_time(tmp_path: Path) -> None:
         assert shown[250:290] == expected(text)[:40]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_no_warning_where_people_and_signals_agree(tmp_path: Path, run_egvs) -> None:
     scenario = new_with_people(tmp_path)
@@ -95,6 +97,7 @@ def test_no_warning_where_people_and_signals_agree(tmp_path: Path, run_egvs) -> 
     assert "Set traffic.warmup_s and begin_s so that their sum is 300" in text
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_keys_of_the_scenario(tmp_path: Path, run_egvs) -> None:
     (tmp_path / "map.net.xml").write_text(NETWORK)

@@ -125,6 +125,7 @@ def test_shipped_model_has_metadata():
     assert metadata["curve"][-1]["ap_bev_r40_iou50"] > 0.5  # of held-out frames and poses
 
 
+@pytest.mark.slow
 def test_detections_do_not_depend_on_intensity(mini):
     """Geometry alone decides; with each point's own intensity, the same network depends on it."""
     scene = egvs.build_scene(load(mini, ["sites.sensor=VLP-32C"]))

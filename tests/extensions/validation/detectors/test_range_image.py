@@ -189,6 +189,7 @@ def test_neighbours_in_rings():
             assert direction[other] @ direction[beam] >= cosine.max() - 1e-6
 
 
+@pytest.mark.slow
 def test_graph_is_symmetric_and_joins_beams_within_8_degrees():
     for name in ("VLP-16", "RS-M1", "Livox HAP"):
         sensor = CATALOGUE[name]

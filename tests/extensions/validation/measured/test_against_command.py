@@ -124,6 +124,7 @@ def test_points_of_kitti_are_sweeps(folder: Path, tmp_path: Path, run_egvs: Any)
     assert code == 2 and "expected records of 16 bytes" in error
 
 
+@pytest.mark.slow
 def test_world_and_pose_of_a_scenario(folder: Path, mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     """Over level ground far from the building, a site of a scenario sees what the fitted ground plane does."""
     pose = twin.POSE
@@ -173,6 +174,7 @@ def counts(path: Path) -> np.ndarray:
     return np.array([[box["simulated"], box["measured"]] for box in boxes])
 
 
+@pytest.mark.slow
 def test_frames_of_sweeps_give_the_same_points(made: twin.Twin, mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     """A sensor upside down whose beams are those of an upright one in the world, with and without a site."""
     common = ("--sensor", SENSOR, "--detector", "points", "--out")
@@ -205,6 +207,7 @@ def test_frames_of_sweeps_give_the_same_points(made: twin.Twin, mini: Path, tmp_
     assert code == 2 and "the ground of the sweeps is not that below site mast" in error
 
 
+@pytest.mark.slow
 def test_levelled_sweeps_are_reported(made: twin.Twin, mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     """The pose of the site is tilted and upside down; the sweeps are those of a program that levels them."""
     pose = twin.POSE
@@ -226,6 +229,7 @@ def test_levelled_sweeps_are_reported(made: twin.Twin, mini: Path, tmp_path: Pat
     assert code == 2 and "the sweeps are upside down for site mast" in error and "sites.mount=upright" in error
 
 
+@pytest.mark.slow
 def test_other_rings_are_reported_and_nothing_is_fitted(folder: Path, tmp_path: Path, run_egvs: Any) -> None:
     common = ("--against", folder, "--labels", folder, "--detector", "points", "--out", tmp_path / "out")
     code, printed, error = run_egvs("validate", *common, "--sensor", "OS1-64 2048")

@@ -166,6 +166,7 @@ def write_and_compare(folder: Path, labels: list[Path], sweeps: twin.Twin, **opt
     return compare_labelled(request)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", [twin.write_kitti, twin.write_dair])
 def test_formats_of_labels_agree(
     tmp_path: Path, made: tuple[Path, twin.Twin], compared: Comparison, write: object
@@ -176,6 +177,7 @@ def test_formats_of_labels_agree(
     assert (other.convention is None) == (write is twin.write_kitti)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "sign", "from_rad"),
     [("x-ccw", 1, 0.0), ("x-cw", -1, 0.0), ("y-ccw", 1, math.pi / 2), ("y-cw", -1, math.pi / 2)],
@@ -192,6 +194,7 @@ def test_conventions_of_headings_are_found(
     assert any(f"Headings are taken as {name}" in sentence for sentence in sentences(other))
 
 
+@pytest.mark.slow
 def test_unclear_headings_are_refused(tmp_path: Path, made: tuple[Path, twin.Twin]) -> None:
     _, sweeps = made
     turned = twin.Twin(sweeps.points_m, [boxes.copy() for boxes in sweeps.boxes])
@@ -245,6 +248,7 @@ def test_ratio_and_error_by_hand() -> None:
     assert math.isnan(ratio_of_sums(above, below, np.array([0, 0, 1, 1, 2, 2])).se)  # three objects
 
 
+@pytest.mark.slow
 def test_real_sweeps_of_an_ouster() -> None:
     """The losses of the catalogue were fitted with these sweeps, so this is no test of them."""
     if not TUMTRAF.is_dir():

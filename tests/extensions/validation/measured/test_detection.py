@@ -46,6 +46,7 @@ def test_area_under_curve_by_hand() -> None:
     assert np.isnan(area_under_curve(values[1:], found[1:]))
 
 
+@pytest.mark.slow
 def test_simulated_copy_is_found_as_the_simulation(tmp_path: Path) -> None:
     pytest.importorskip("sklearn")
     sweeps = twin.make_twin(ReturnModel.of(CATALOGUE[SENSOR]), seed=4)
