@@ -96,7 +96,7 @@ def describe_joint_score(by: ScoreLabel, sensors: int) -> str:
     if sensors < 2 or not (by.name in _INDEPENDENT_SCORES or is_plugin_score(by.name)):
         return ""
     return (
-        "Joint shares assume that sensors miss vehicles independently; near 100 % they are upper ends "
+        "Joint shares assume independent detectors, one per sensor (an upper end); fused clouds have one "
         "(docs/placement.md)."
     )
 
