@@ -28,7 +28,7 @@ def what_if(
         typer.Option(metavar="NAME", help="Evaluate only the table \\[what_if.NAME] (repeatable); all by default."),
     ] = None,
 ) -> None:
-    """What if a lorry parks there? Does the best site change with solids that are there for a share of the time?"""
+    """What if a lorry parks there? Score the sites with the solids of tables \\[what_if.NAME] of scenario.toml."""
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay("what-if") as screen:

@@ -336,7 +336,9 @@ def warn_sites_on_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
     on_road = list(_sites_on_road(inputs.sites, inputs.carriageway, inputs.network))
     hint = f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it."
     for site, where in on_road[:MAX_LISTED_SITES]:
-        problem = f"({site.pose.x_m:g}, {site.pose.y_m:g}, {site.pose.z_m:g}) is {where}"
+        (kerb_m,) = inputs.carriageway.nearest_kerb_m(np.array([site.pose.position_m[:2]]))
+        positions = (*site.pose.position_m, where, *kerb_m)
+        problem = "({:g}, {:g}, {:g}) is {}; the nearest kerb is at ({:.1f}, {:.1f})".format(*positions)
         yield Diagnostic("sites on lanes", inputs.site_location(site), problem, hint)
     others = on_road[MAX_LISTED_SITES:]
     if others:
@@ -416,7 +418,7 @@ def pole_surroundings(inputs: CheckInputs) -> tuple[PoleSurroundings, ...]:
     at_m = np.array([site.pose.position_m[:2] for site in sites])
     where, kerb_m = [""] * len(sites), np.full(len(sites), np.nan)
     if inputs.carriageway is not None and inputs.carriageway.lanes:
-        kerb_m = inputs.carriageway.kerb_distance_m(at_m)
+        kerb_m = np.hypot(*(inputs.carriageway.nearest_kerb_m(at_m) - at_m).T)
         on_road = {site.pole: place for site, place in _sites_on_road(sites, inputs.carriageway, inputs.network)}
         beside: dict[int, str] = {}
         for number, site in enumerate(sites):

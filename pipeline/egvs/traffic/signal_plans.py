@@ -59,13 +59,8 @@ CSV_OPTIONAL = ("yellow_s", "all_red_s", "min_green_s", "max_green_s")
 _CSV_HINT = f"Columns: {', '.join(CSV_COLUMNS)}; optional: {', '.join(CSV_OPTIONAL)}."
 
 
-def check_plans(scenario: Scenario, path: Path, roads: network.Network) -> None:
-    """Raise an InputError if a plan of the scenario is wrong for a network; parameters as in :func:`apply_plans`."""
-    _programs(scenario, path, roads)
-
-
 def planned_signals(scenario: Scenario, path: Path, roads: network.Network) -> list[Signal]:
-    """Return the signals of a network with the plans of the scenario; parameters as in :func:`apply_plans`."""
+    """Return the signals of a network with the plans of the scenario; parameters and errors of :func:`apply_plans`."""
     programs = _programs(scenario, path, roads)
     signals = read_signals(path, roads)
     return [replace(signal, program=programs.get(signal.id, signal.program)) for signal in signals]
@@ -285,7 +280,7 @@ def _check_conflicts(green: set[int], signal: Signal, where: str) -> None:
     for a, b in combinations(links, 2):
         if not agree(a, b):
             problem = f"{a.title} and {b.title} conflict, but both have green"
-            raise InputError(where, problem, "Give them green in different phases.")
+            raise InputError(where, problem, "Use different phases: in the network, neither gives way to the other.")
 
 
 def agree(a: Link, b: Link) -> bool:

@@ -173,7 +173,7 @@ def read_network(scenario: Scenario) -> network.Network | None:
 
 def check_signal_plans(scenario: Scenario, path: Path) -> None:
     """Raise an InputError if a plan of a signal does not fit the network in a file."""
-    signal_plans.check_plans(scenario, path, network.read_net_xml(path))
+    signal_plans.planned_signals(scenario, path, network.read_net_xml(path))
 
 
 def copy_network(scenario: Scenario, folder: Path) -> None:

@@ -117,16 +117,16 @@ class Carriageway:
         inset = shapely.buffer(_outlines(self.junctions), -clearances.LANE_INSET_M)
         return shapely.union_all(shapely.difference(inset, shapely.union_all(_outlines(self.corners))))
 
-    def kerb_distance_m(self, at_m: FloatArray) -> FloatArray:
-        """Return the distance of each point (n, 2) to the edge of the carriageway, from outside or inside, (n,)."""
+    def nearest_kerb_m(self, at_m: FloatArray) -> FloatArray:
+        """Return the point of the edge of the carriageway that is nearest to each point (n, 2), (n, 2)."""
         import shapely
 
         _, nearest_m = self._tree.query_nearest(shapely.points(at_m), return_distance=True, all_matches=False)
         margin_m = nearest_m.max() + 2.0 * LANE_WIDTH_M
         lanes = self.within(at_m.min(axis=0) - margin_m, at_m.max(axis=0) + margin_m)
         surface = shapely.union_all([shapely.buffer(lanes, clearances.LANE_INSET_M), self._junction_interiors])
-        distance_m: FloatArray = shapely.distance(shapely.boundary(surface), shapely.points(at_m))
-        return distance_m
+        ways = shapely.shortest_line(shapely.boundary(surface), shapely.points(at_m))
+        return np.asarray(shapely.get_coordinates(shapely.get_point(ways, 0)), dtype=np.float64)
 
     def touching(self, shapes: Sequence[BaseGeometry] | NDArray[Any]) -> IntArray:
         """Return each pair of a shape and a lane that intersect, as indices (2, k)."""

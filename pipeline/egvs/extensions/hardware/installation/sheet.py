@@ -475,7 +475,7 @@ def _tolerance_table(parts: list[str], result: PoseTolerances, y: float, width: 
     parts.append(_text(_MARGIN, y, f"Tolerances: what costs {result.point}", 15, bold=True))
     source = (
         f"{label.noun} is {label.value(result.planned)} {label.unit}".rstrip()
-        + f" as planned, from {result.frames:,} frames of traffic; each quantity is changed alone."
+        + f" as planned, from a sample of {result.frames:,} frames; each quantity is changed alone."
     )
     parts.append(_text(_MARGIN, y + 22, f"{source[:1].upper()}{source[1:]}", 12.5, colour="#4a5262"))
     y += 30
