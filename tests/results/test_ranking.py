@@ -162,7 +162,7 @@ def test_no_number_is_printed_for_a_level_that_was_not_measured() -> None:
     )
     without = replace(BOTH, has_losses=False)
     assert ranking_text.headline(by_vehicles(("a", 1.0, 0.9), ("b", 1.0, 0.8)), True, without) == (
-        "a is the best of 2 sites: level not measured for detectors without losses of returns"
+        "a is the best of 2 sites: level not measured for detectors without losses of returns (see rated_range_m)"
     )
     assert DetectionLevel(("cluster_uncorrected",), has_losses=False).is_measured
     off = load(SCENARIOS / "demo", ["effects.range_limit=false"])

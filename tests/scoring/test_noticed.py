@@ -246,7 +246,7 @@ def test_groups_have_a_level_each(mini: Path, tmp_path: Path, run_egvs) -> None:
     # the sensor has no rated range, so no level of the corrected detectors was measured
     assert line.split()[2] == str(larger["observations"]) and line.split("  ")[-2:] == [NOT_MEASURED, noticed_text]
     page = (tmp_path / "report.html").read_text(encoding="utf-8").replace("\u00a0", " ")
-    unknown = f"{NOT_MEASURED} for detectors without losses of returns; people would notice"
+    unknown = f"{NOT_MEASURED} for detectors without losses of returns (see rated_range_m); people would notice"
     assert unknown in " ".join(printed.split()) and unknown in page
     assert "TUM Traffic Intersection Dataset, Zimmer et al. 2023" in page
     assert f'<th scope="row">larger vehicles</th><td class="n">{larger["observations"]}</td>' in page

@@ -70,7 +70,7 @@ def level(site: RankedSite, found: DetectionLevel) -> str:
             outside = format_percent(found.range.outside, 0)
             text += f" (nothing is known of the {outside} that are not {' or '.join(found.range.measured)})"
     else:
-        without = "" if found.has_losses else " without losses of returns"
+        without = "" if found.has_losses else " without losses of returns (see rated_range_m)"
         text = f"{NOT_MEASURED} for {names}{without}"
     if site.noticed is not None:
         text += f"; people would notice {site.noticed.text}"
