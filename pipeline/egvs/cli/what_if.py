@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -29,7 +29,7 @@ def what_if(
     ] = None,
 ) -> None:
     """What if a lorry parks there? Score the sites with the solids of tables \\[what_if.NAME] of scenario.toml."""
-    from egvs.cli.console import ProgressDisplay
+    from egvs.cli.console import ProgressDisplay, print_sentences
 
     with ProgressDisplay("what-if") as screen:
         from egvs.studies import what_if as study
@@ -47,8 +47,35 @@ def what_if(
         written = study.record_answers(result)
         screen.end_parts("what-if")
     print_what_if(result)
+    print_sentences(describe_plan(result))
     for path in written:
         print(path)
+
+
+def describe_plan(result: WhatIfResult) -> Iterator[str]:
+    """Yield what the solids of each table change of the plan of the run, if it has one of its present stages."""
+    from egvs.artefacts.run_folder import RunFolder
+    from egvs.artefacts.run_record import RunRecord
+    from egvs.core.digests import use_digests
+    from egvs.placement.changed_plan import describe_in_other_world
+    from egvs.results.plans import SensorPlan
+    from egvs.runs.run import lock_run_folder
+    from egvs.runs.run_context import open_folder
+    from egvs.runs.stage_registry import recorded_digests
+
+    base, *others = result.runs
+    plan = SensorPlan.read(RunFolder(base.folder))
+    if plan is None or not plan.belongs_to(RunRecord.read(base.folder).stages):
+        return
+    with lock_run_folder(base.folder):
+        context, *changed = (
+            open_folder(each.scenario, each.folder, recorded=recorded_digests(RunRecord.read(each.folder)))
+            for each in result.runs
+        )
+        with use_digests(context.inputs.digests):
+            for what_if_run, other, answer in zip(others, changed, result.answers, strict=False):
+                sentence = describe_in_other_world(context, plan, other, answer.impossible)
+                yield f"With {what_if_run.name}, {sentence}"
 
 
 def _run_label(what_if_run: WhatIfRun) -> str:

@@ -27,7 +27,6 @@ from egvs.scoring.blindspots import VehicleSpots
 from egvs.scoring.road_locations import RoadLocation
 from egvs.scoring.targets import TargetRecord
 from egvs.stages.base import StageContext
-from egvs.studies.what_if import prepare_runs
 from tests.conftest import write_mini
 from tests.scoring.target_scenes import frame
 
@@ -149,23 +148,6 @@ def test_error_of_a_change_is_that_of_paired_blocks(planned: tuple[StageContext,
     tried = plan_sensors.try_sensors(context, plan, open_run(twin, context.folder.path))
     assert (tried.joint, tried.joint_se) == (plan.joint, pytest.approx(plan.joint_se, rel=1e-9))
     assert tried.change_se == pytest.approx(0.0, abs=1e-12 * plan.joint)
-
-
-def test_plan_among_other_solids_has_the_score_of_their_run(
-    planned: tuple[StageContext, SensorPlan], tmp_path: Path
-) -> None:
-    context, plan = planned
-    same = plan_sensors.score_in_other_world(context, plan, context)
-    assert (same.joint, same.joint_se) == (plan.joint, pytest.approx(plan.joint_se, rel=1e-9))
-    assert same.change_se == pytest.approx(0.0, abs=1e-12 * plan.joint)
-    settings = (f"score.rank_by={plan.score}", "placement.count=2")
-    lorry = "what_if.lorry={share = 1, boxes = [{x_m = 20, y_m = 5, length_m = 12, width_m = 2.5, height_m = 3.8}]}"
-    _, other = prepare_runs(write_mini(tmp_path / "mini"), (*settings, lorry))
-    there = egvs.place(other.scenario, other.folder)
-    changed = plan_sensors.score_in_other_world(context, plan, open_run(other.scenario, other.folder))
-    assert (changed.joint, changed.joint_se) == (there.joint, pytest.approx(there.joint_se, rel=1e-9))
-    assert 0.0 < changed.change_se < changed.joint_se + plan.joint_se
-    assert changed.joint < plan.joint
 
 
 def test_sensor_with_measured_scan_cannot_be_exchanged(

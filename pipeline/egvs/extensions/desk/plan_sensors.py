@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from egvs.artefacts.readers import LocationVisibility, SiteBlindspots
-from egvs.artefacts.tpog import read_periods, read_tpog
+from egvs.artefacts.tpog import read_tpog
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
 from egvs.explore.session import site_blindspots
-from egvs.placement.plan_error import UNKNOWN_ERROR, PlanErrors, PlanReplicates
-from egvs.placement.problem import CoverageState, CoverageTerm, VisibilityMatrix
-from egvs.placement.problem_builder import View, build_problem, make_objective, read_tpogs
+from egvs.placement.changed_plan import ChangedPlan, joint_term
+from egvs.placement.plan_error import PlanErrors
+from egvs.placement.problem import CoverageState
+from egvs.placement.problem_builder import build_problem
 from egvs.results.labels import join_names
 from egvs.results.plans import SensorPlan
 from egvs.scoring.blindspots import SpotVisibility, VehicleSpots
-from egvs.scoring.visibility import Beams
 from egvs.scoring.zone_results import detection_probabilities
-from egvs.sensors.sites import Site
 from egvs.stages.base import StageContext
 from egvs.stages.plan_scans import plan_beams
 from egvs.stages.site_scoring import TargetScorer
@@ -97,23 +96,6 @@ def _share(location: LocationVisibility) -> str:
     return format_percent(location.share, 0)
 
 
-@dataclass(frozen=True)
-class ChangedPlan:
-    """The joint score of a plan after a change, with standard errors; NaN where they are unknown.
-
-    Attributes
-    ----------
-    joint, joint_se
-        The joint score.
-    change_se
-        Of its difference from that of the plan, paired by blocks of frames and detectors.
-    """
-
-    joint: float
-    joint_se: float
-    change_se: float
-
-
 def try_sensors(context: StageContext, plan: SensorPlan, changed: StageContext) -> ChangedPlan:
     """Return the joint score of a plan with the sensors that its candidates have in another scenario.
 
@@ -147,46 +129,8 @@ def try_sensors(context: StageContext, plan: SensorPlan, changed: StageContext) 
     if len(sites) == len(plan.sensors):
         raise InputError("the plan", "its sensors are these already", "Choose another sensor for one of its poles.")
 
-    term, view = _joint_term(changed, sites)
+    term, view = joint_term(changed, sites)
     errors = PlanErrors(changed, replace(build_problem(context, lambda _: None), views=(view,)))
     plans = [tuple(range(len(plan.sensors))), tuple(tried)]
     error = errors.of_plans(term, plans, sites, moved=True)[1]
     return ChangedPlan(CoverageState([term], tried).value(term), error.score_se, error.gain_se)
-
-
-def score_in_other_world(context: StageContext, plan: SensorPlan, changed: StageContext) -> ChangedPlan:
-    """Return the joint score of a plan among other solids.
-
-    Parameters
-    ----------
-    context
-        The run that the plan belongs to.
-    plan
-        The plan, whose empty scans are simulated.
-    changed
-        A run with the same traffic and candidates among other solids.
-
-    Raises
-    ------
-    InputError
-        If a sensor of the plan cannot be scanned or scored.
-    """
-    sites = [sensor.mount for sensor in plan.sensors]
-    chosen = range(len(sites))
-    term, view = _joint_term(context, sites)
-    other_term, other_view = _joint_term(changed, sites)
-    candidates = build_problem(context, lambda _: None)
-    errors, error = PlanErrors(context, replace(candidates, views=(view,))), UNKNOWN_ERROR
-    if errors.are_known:
-        periods = read_periods(changed.folder.tpog)
-        replicates = PlanReplicates(changed, replace(candidates, views=(other_view,)), periods)
-        (row,) = replicates.of_plans(other_term, [chosen], sites, moved=True)
-        error = errors.of_change(term, sites, row)
-    return ChangedPlan(CoverageState([other_term], chosen).value(other_term), error.score_se, error.gain_se)
-
-
-def _joint_term(context: StageContext, sites: Sequence[Site]) -> tuple[CoverageTerm, View]:
-    """Return the joint score of some sensors, scanned anew, and what turned their scans into its cells."""
-    objective = make_objective(context, read_tpogs(context))
-    rows = [objective.view.row(Beams.of(context.inputs.scanner.scan_site(site))) for site in sites]
-    return objective.terms(VisibilityMatrix.of(rows, objective.view.n_cells))[""], objective.view

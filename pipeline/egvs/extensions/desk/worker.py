@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from egvs.results.plans import SensorPlan
     from egvs.scenario.model import Scenario
     from egvs.stages.base import StageContext
-    from egvs.studies.what_if import WhatIfRun
 
 _INTERVAL_S = 0.15
 Send = Callable[[dict[str, Any]], None]
@@ -194,6 +193,7 @@ def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str,
     from dataclasses import replace
 
     from egvs.artefacts.run_folder import RunFolder
+    from egvs.placement.changed_plan import describe_in_other_world
     from egvs.results.ranking import Ranking, site_titles
     from egvs.results.sensors import difference_unit, format_difference
     from egvs.studies.what_if import what_if
@@ -224,27 +224,12 @@ def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str,
     )  # fmt: skip
     text = [answer.conclusion(), *result.notes]
     if request["has_plan"]:
-        text.insert(0, _describe_changed_plan(request, result.runs[1], answer.impossible))
+        changed = result.runs[1]
+        with _open_plan(request) as (context, planned):
+            other = _open_run(changed.scenario, changed.folder)
+            sentence = describe_in_other_world(context, planned, other, answer.impossible)
+        text.insert(0, f"With the obstacles, {sentence}")
     return {"text": text, "sites": rows}
-
-
-def _describe_changed_plan(request: dict[str, Any], changed: WhatIfRun, impossible: Sequence[str]) -> str:
-    """Say what the obstacles change of the joint score of the plan."""
-    from egvs.core.wording import number_of
-    from egvs.extensions.desk import plan_sensors
-
-    with _open_plan(request) as (context, planned):
-        plan_text = f"the plan of {number_of(len(planned.sensors), 'sensor')}"
-        if gone := [sensor.pole or sensor.site for sensor in planned.sensors if sensor.site in impossible]:
-            return f"With the obstacles, {plan_text} is not possible: {gone[0]} is in the way."
-        if any(sensor.mount.points for sensor in planned.sensors):
-            return f"What changes for {plan_text} is unknown: an empty scan was measured without the obstacles."
-        other = _open_run(changed.scenario, changed.folder)
-        score = plan_sensors.score_in_other_world(context, planned, other)
-    by = planned.by
-    before, after = by.with_unit(planned.joint, planned.joint_se), by.with_unit(score.joint, score.joint_se)
-    change = f"{by.change(score.joint - planned.joint, score.change_se)} {by.change_unit}".rstrip()
-    return f"With the obstacles, {by.noun} of {plan_text} is {after} instead of {before} (change {change})."
 
 
 def describe_traffic(_progress: Progress, request: dict[str, Any]) -> dict[str, Any]:
