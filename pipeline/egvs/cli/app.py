@@ -789,10 +789,7 @@ def new(
         ),
     ] = None,
 ) -> None:
-    """Create a scenario from maps of roads, buildings and other objects.
-
-    Its scenario.toml has a template for peaks and other parts of the day (traffic.periods).
-    """
+    """Create a scenario from maps of roads, buildings and other objects."""
     from egvs.cli import new_summary
     from egvs.creation import new_scenario
     from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC

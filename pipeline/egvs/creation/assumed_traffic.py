@@ -124,7 +124,7 @@ class AssumedTraffic:
         yield _assumed_warning(assumed, self.per_h, scenario_file)
 
     def add_keys(self, table: Any, streets: Streets, junction: StreetJunction) -> None:
-        """Name the table of the counts, and add a template for periods, to ``[traffic]``."""
+        """Name the table of the counts in ``[traffic]``, and say how periods are added."""
         table.update({"counts": scenario_files.COUNTS_FILE})
         origin = "assumed from the road classes" if self.level is not None else "divided by the road classes"
         table["counts"].comment(f"{origin}: replace its numbers by real counts")
