@@ -17,13 +17,15 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler
-from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from egvs.extensions.desk import jobs
+from egvs.extensions.desk.jobs import start_worker
 from tests.creation.overpass_server import overpass_server, recorded_answer
 from tests.extensions.desk.conftest import MAP
 from tests.extensions.desk.serving import Client
@@ -45,11 +47,20 @@ def listening(desk: Client) -> Iterator[http.client.HTTPResponse]:
 
 
 @contextmanager
-def paused_worker() -> Iterator[int]:
-    """Pause the worker of this process; yields its number."""
-    children = chain.from_iterable(path.read_text().split() for path in Path("/proc/self/task").glob("*/children"))
-    (worker,) = (pid for pid in map(int, children) if b"desk.worker" in Path(f"/proc/{pid}/cmdline").read_bytes())
-    os.kill(worker, signal.SIGSTOP)
+def paused_run(desk: Client) -> Iterator[int]:
+    """Start a run whose worker is paused before it does anything; yields its number."""
+    workers = []
+
+    def start_paused(request: dict[str, Any]) -> subprocess.Popen[str]:
+        process = start_worker(request)
+        os.kill(process.pid, signal.SIGSTOP)
+        workers.append(process.pid)
+        return process
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jobs, "start_worker", start_paused)
+        desk.ok("POST", "/api/run", {})
+    (worker,) = workers
     try:
         yield worker
     finally:
@@ -164,8 +175,7 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
     for path in ("/api/score", "/api/three"):
         assert desk.refused("POST", path, {"site": "pole_a"})[0] == 409
     with listening(desk) as events:
-        desk.ok("POST", "/api/run", {})
-        with paused_worker() as worker:  # it cannot end meanwhile
+        with paused_run(desk) as worker:  # it cannot end meanwhile
             assert desk.refused("POST", "/api/run", {})[0] == 409
             assert desk.refused("PATCH", "/api/sites/pole_a", {"z_m": 4})[0] == 409
             threading.Timer(1.0, os.kill, (worker, signal.SIGCONT)).start()  # finds the signal to stop

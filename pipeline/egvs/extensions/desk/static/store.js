@@ -120,7 +120,7 @@ function refreshResults() {
   if (key === resultsKey) return;
   resultsKey = key;
   attempt(async () => {
-    const hasRun = project.run.state !== "none";
+    const hasRun = ["complete", "outdated"].includes(project.run.state); // a run that was stopped may lack scores
     const ranking = hasRun ? await getIfAny("ranking") : null;
     const plan = hasRun && project.run.has_plan ? await getIfAny("plan") : null;
     if (data.project?.id === project.id) update({ ranking, plan, downloads: null, trial: null });
