@@ -45,7 +45,7 @@ def test_score_among_other_solids_is_that_of_a_run_with_them(score: str, tmp_pat
     assert (changed.joint, changed.joint_se) == (there.joint, pytest.approx(there.joint_se, rel=1e-9))
     assert 0.0 < changed.change_se < changed.joint_se + plan.joint_se
     assert changed.joint < plan.joint
-    assert "is in the way" in changed_plan.describe_in_other_world(context, plan, opened, {plan.sensors[1].site})
+    assert "rule out" in changed_plan.describe_in_other_world(context, plan, opened, {plan.sensors[1].site})
 
 
 def test_what_if_says_what_changes_for_the_plan(tmp_path: Path, run_egvs: Any, monkeypatch: pytest.MonkeyPatch) -> None:

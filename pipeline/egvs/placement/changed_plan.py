@@ -78,7 +78,7 @@ def describe_in_other_world(
     """
     plan_text = f"the plan of {number_of(len(plan.sensors), 'sensor')}"
     if gone := [sensor.pole or sensor.site for sensor in plan.sensors if sensor.site in impossible]:
-        return f"{plan_text} is not possible: {gone[0]} is in the way."
+        return f"{plan_text} is not possible: the solids rule out {gone[0]}."
     if any(sensor.mount.points for sensor in plan.sensors):
         return f"what changes for {plan_text} is unknown, since an empty scan was measured."
     score, by = score_in_other_world(context, plan, changed), plan.by
