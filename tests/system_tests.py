@@ -5,6 +5,7 @@ from __future__ import annotations
 SYSTEM = (
     "tests/core/test_sandbox",
     "tests/creation/",
+    "tests/drawing/test_svg_figures",
     "tests/effects/test_articulated",
     "tests/effects/test_pedestrians_bicycles",
     "tests/effects/test_slope",
@@ -20,4 +21,4 @@ SYSTEM = (
     "tests/studies/",
     "tests/traffic/",
 )
-"""Starts of paths. SUMO runs there, or whole runs are made, interrupted and compared."""
+"""Starts of paths. SUMO runs there, fonts are listed, or whole runs are made, interrupted and compared."""

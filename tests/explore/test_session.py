@@ -295,6 +295,7 @@ def test_best_additional_candidate_has_the_largest_gain(planned: tuple[Session, 
     assert math.isclose(plan.best_next[1], max(gains.values()), rel_tol=1e-9)
 
 
+@pytest.mark.system
 def test_refined_plan_has_its_refined_poses(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text(SITES)
     scenario = egvs.load(mini, ["placement.count=2", "placement.refine.evaluations=20"])
