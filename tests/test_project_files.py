@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import egvs
+from tests.installed import COMPLETE
 
 ROOT = Path(__file__).resolve().parent.parent
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
@@ -53,6 +54,13 @@ def make_targets() -> set[str]:
     assert phony is not None
     assert set(phony[1].split()) == targets
     return targets
+
+
+def test_make_test_runs_the_tests_that_are_marked_complete() -> None:
+    """Tests in another folder would be left out by their mark."""
+    listed = re.search(r"^COMPLETE_TESTS := (.*)$", read("Makefile"), re.MULTILINE)
+    assert listed is not None
+    assert {f"{folder}/" for folder in listed[1].split()} | {"tests/extensions/"} == set(COMPLETE)
 
 
 def constraints() -> dict[str, str]:

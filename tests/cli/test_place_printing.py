@@ -25,7 +25,7 @@ FIRST_LINE = "The plan a, b should find 99.2 ± 0.3 % of vehicles; proved: no pl
 LAST_LINES = """\
 A second sensor adds 4.7 ± 0.5 percentage points to the share of vehicles found: 99.2 %, against 94.5 % with one. \
 Try --count 3 to see what a third adds.
-Joint shares assume independent detectors, one per sensor (an upper end); fused clouds have one (docs/placement.md).
+Joint shares assume one independent detector per sensor (an upper end); fused clouds, only one (docs/placement.md).
 """
 
 

@@ -112,8 +112,8 @@ def test_streets_without_tags_have_notes_and_a_name(tmp_path: Path) -> None:
     network = street_network.build_network(extract(ways, tags), tmp_path / "map.osm", street_network.NETCONVERT_FLAGS)
     assert {edge.name for edge in network.streets.network.edges} == {"B 62", ""}
     assert network.notes == (
-        "Lanes that the map does not state, by road class: 2 for 4 edges.",
-        "Speed limits that the map does not state, by road class: 100 km/h for 4 edges.",
+        "Lanes assumed by road class: 2 for 4 edges.",
+        "Speed limits assumed by road class: 100 km/h for 4 edges.",
     )
 
 

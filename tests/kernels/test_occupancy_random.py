@@ -176,7 +176,7 @@ def test_point_on_the_floor_is_inside_and_on_the_roof_outside():
 
 
 def test_smallest_triangles_of_the_lattice():
-    """Twice the areas of the three parts about the point (0, 1) are 1, the least; a smaller triangle is none."""
+    """Twice the areas of the three parts around the point (0, 1) are 1, the smallest area that counts."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [-1, 3, 0]]) * occupancy.SNAP_M + [0.0, 0.0, 6.0]
     corners[2, 2] = 9.0
     assert occupancy.vertical_crossing(corners, 0.0, occupancy.SNAP_M) == (1, 7.0)

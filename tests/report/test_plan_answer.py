@@ -81,7 +81,7 @@ def test_first_site_of_a_plan_is_compared_with_the_best_single_one() -> None:
 
 
 def test_only_several_sensors_ranked_by_vehicles_found_assume_independence() -> None:
-    assert "assume independent detectors" in describe_joint_score(FOUND, 2)
+    assert "one independent detector per sensor" in describe_joint_score(FOUND, 2)
     assert describe_joint_score(FOUND, 1) == ""
     assert describe_joint_score(EGVS, 2) == ""
 

@@ -370,7 +370,7 @@ def test_ranks_and_plans_by_the_score_of_a_plugin(
         assert joint.value == pytest.approx((1 - (1 - chances["s1"]) * (1 - chances["s2"])).mean(), rel=1e-9)
     code, printed, error = run_egvs("place", out, "--count", "2")
     assert code == 0, error
-    assert "independent detectors" in printed
+    assert "independent detector" in printed
     assert run_egvs("verify", out)[0] == 0
     rated = egvs.open_session(out).rate("s1", scanner.scene.sites[1].pose)
     assert rated.scores["my_score"] == pytest.approx(rows["s1"]["my_score"], rel=1e-12)

@@ -64,10 +64,10 @@ def describe_plan(result: WhatIfResult) -> Iterator[str]:
     from egvs.runs.stage_registry import recorded_digests
 
     base, *others = result.runs
-    plan = SensorPlan.read(RunFolder(base.folder))
-    if plan is None or not plan.belongs_to(RunRecord.read(base.folder).stages):
-        return
     with lock_run_folder(base.folder):
+        plan = SensorPlan.read(RunFolder(base.folder))
+        if plan is None or not plan.belongs_to(RunRecord.read(base.folder).stages):
+            return
         context, *changed = (
             open_folder(each.scenario, each.folder, recorded=recorded_digests(RunRecord.read(each.folder)))
             for each in result.runs

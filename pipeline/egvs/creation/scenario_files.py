@@ -60,7 +60,7 @@ _KEY_COMMENTS = {  # of tables and keys; the table of a key above all tables is 
     ("sites", "existing_poles"): "poles that stand already, or 'all': they cost nothing",
     ("sites", "sensor"): "or a list: each is a candidate",
     ("sites", "aim"): "the centre of the region",
-    ("sites", "pitch_deg"): "each with each height; 'aim' points the central ray at the centre",
+    ("sites", "pitch_deg"): "each is tried at each height; 'aim' points the central ray at the centre",
 }
 
 

@@ -96,7 +96,7 @@ def describe_joint_score(by: ScoreLabel, sensors: int) -> str:
     if sensors < 2 or not (by.name in _INDEPENDENT_SCORES or is_plugin_score(by.name)):
         return ""
     return (
-        "Joint shares assume independent detectors, one per sensor (an upper end); fused clouds have one "
+        "Joint shares assume one independent detector per sensor (an upper end); fused clouds, only one "
         "(docs/placement.md)."
     )
 

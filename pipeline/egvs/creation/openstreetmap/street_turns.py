@@ -680,11 +680,11 @@ def _assumption_notes(graph: StreetGraph) -> Iterator[str]:
     """Yield sentences on the lanes and speed limits that are netconvert's defaults."""
     lanes = Counter(edge.lanes for edge in graph.edges_without(_LANE_KEYS))
     if lanes:
-        yield f"Lanes that the map does not state, by road class: {_edge_counts(lanes)}."
+        yield f"Lanes assumed by road class: {_edge_counts(lanes)}."
     speeds_km_h = Counter(round(edge.speed_m_s * 3.6) for edge in graph.edges_without(_SPEED_KEYS))
     if speeds_km_h:
         counts = _edge_counts(speeds_km_h, " km/h")
-        yield f"Speed limits that the map does not state, by road class: {counts}."
+        yield f"Speed limits assumed by road class: {counts}."
 
 
 def _edge_counts(values: Counter[int], unit: str = "") -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,32 +36,33 @@ def describe_streets(streets: Streets, attribution: str) -> dict[str, Any]:
     """
     lanes = list(_lanes(streets.network))
     crossings = junctions.distinct_crossings(streets)
-    totals, numbers = Counter(junction.title for junction in crossings), Counter[str]()
-    described = []
-    for junction in crossings:
-        numbers[junction.title] += 1
-        title, total = junction.title, totals[junction.title]
-        if total > 1:
-            title += f" ({numbers[junction.title]} of {total})"
-        described.append({**_describe_junction(streets, junction), "title": title})
+    titles = _numbered([junction.title for junction in crossings])
     points_m = [point for lane in lanes for point in lane["points_m"]]
     low, high = np.min(points_m, axis=0), np.max(points_m, axis=0)
     return {
         "bounds_m": [*low.tolist(), *high.tolist()],
         "frame": None if streets.frame is None else [streets.frame.projection, streets.frame.offset_m],
         "lanes": lanes,
-        "junctions": described,
+        "junctions": [_describe_junction(streets, *each) for each in zip(crossings, titles, strict=True)],
         "attribution": attribution,
     }
 
 
-def _describe_junction(streets: Streets, junction: StreetJunction) -> dict[str, Any]:
+def _numbered(titles: Sequence[str]) -> Iterator[str]:
+    """Yield titles; those that several junctions share have a number, such as "Mill Lane (2 of 3)"."""
+    totals, numbers = Counter(titles), Counter[str]()
+    for title in titles:
+        numbers[title] += 1
+        yield title if totals[title] == 1 else f"{title} ({numbers[title]} of {totals[title]})"
+
+
+def _describe_junction(streets: Streets, junction: StreetJunction, title: str) -> dict[str, Any]:
     x_m, y_m = junction.at_m
     at = [round(x_m, 1), round(y_m, 1)]
     if streets.frame is not None:
         at = [round(degrees, 5) for degrees in streets.to_degrees([junction.at_m])[0][::-1]]
     return {
-        "id": junction.id, "title": junction.title, "at": at, "x_m": round(x_m, 2), "y_m": round(y_m, 2),
+        "id": junction.id, "title": title, "at": at, "x_m": round(x_m, 2), "y_m": round(y_m, 2),
         "arms": junction.arms, "signalised": junction.signalised,
         "outline_m": _rings(junction.area)[:1] and _rings(junction.area)[0][0],
     }  # fmt: skip

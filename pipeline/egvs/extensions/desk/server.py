@@ -408,9 +408,7 @@ class Desk:
             self._what_if = digest, result
             return {}
 
-        state = self.project.run_state()
-        has_plan = state["has_plan"] and not state["plan_outdated"]
-        request = {**self._folders, "table": obstacles.TABLE, "has_plan": has_plan}
+        request = {"scenario": str(self.project.folder), "table": obstacles.TABLE}
         return self._start_job("what_if", "What if", request, finish)
 
     def show_what_if(self, _body: Body) -> Answer:

@@ -193,7 +193,7 @@ def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str,
     from dataclasses import replace
 
     from egvs.artefacts.run_folder import RunFolder
-    from egvs.placement.changed_plan import describe_in_other_world
+    from egvs.cli.what_if import describe_plan
     from egvs.results.ranking import Ranking, site_titles
     from egvs.results.sensors import difference_unit, format_difference
     from egvs.studies.what_if import what_if
@@ -222,14 +222,7 @@ def evaluate_obstacles(progress: Progress, request: dict[str, Any]) -> dict[str,
         answer, best_before=titles[answer.best_before], best_expected=titles[answer.best_expected],
         rival=titles.get(answer.rival, ""),
     )  # fmt: skip
-    text = [answer.conclusion(), *result.notes]
-    if request["has_plan"]:
-        changed = result.runs[1]
-        with _open_plan(request) as (context, planned):
-            other = _open_run(changed.scenario, changed.folder)
-            sentence = describe_in_other_world(context, planned, other, answer.impossible)
-        text.insert(0, f"With the obstacles, {sentence}")
-    return {"text": text, "sites": rows}
+    return {"text": [*describe_plan(result), answer.conclusion(), *result.notes], "sites": rows}
 
 
 def describe_traffic(_progress: Progress, request: dict[str, Any]) -> dict[str, Any]:

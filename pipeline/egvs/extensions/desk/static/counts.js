@@ -84,7 +84,6 @@ const diagram = h("div.diagram", {}, arrows, periods, cards);
 const sizes = new ResizeObserver(() => place());
 /** Size of the map on which the cards had no room beside each other. */
 let crowded = "";
-let wasListed = false;
 
 export function drawDiagram() {
   const stage = byId("stage");
@@ -169,14 +168,10 @@ function place() {
   if (!diagram.isConnected) return;
   const map = mapView();
   const size = `${map.width} ${map.height}`;
+  const wasListed = diagram.classList.contains("listed");
   if (crowded !== size) crowded = placeCards() ? "" : size;
-  const isListed = crowded !== "";
-  if (diagram.classList.toggle("listed", isListed) !== wasListed) {
-    wasListed = isListed;
-    map.fit(boxOfMovements());
-    return; // it has called this
-  }
-  placeArrows();
+  if (diagram.classList.toggle("listed", crowded !== "") === wasListed) placeArrows();
+  else map.fit(boxOfMovements()); // calls this again
 }
 
 /** Draw an arrow for each movement, as wide as its count. */
