@@ -52,8 +52,8 @@ def test_what_if_says_what_changes_for_the_plan(tmp_path: Path, run_egvs: Any, m
     monkeypatch.chdir(tmp_path)
     toml = write_mini(tmp_path / "mini") / "scenario.toml"
     toml.write_text(f"{toml.read_text()}\n[what_if.lorry]\nshare = 0.5\n{LORRY}\n")
-    assert "of the plan" not in run_egvs("what-if", "mini")[1]
+    assert "the plan of" not in run_egvs("what-if", "mini")[1]
     run_egvs("place", "mini", "--count", "2")
     number = r"[\d,]+ ± [\d,]+ bit"
-    sentence = rf"With lorry, EGVS of the plan of 2 sensors is {number} instead of {number} \(change -{number}\)\."
+    sentence = rf"With lorry, the plan of 2 sensors changes from {number} to {number} \(by -{number}\)\."
     assert re.search(sentence, run_egvs("what-if", "mini")[1])

@@ -84,7 +84,7 @@ def describe_in_other_world(
     score, by = score_in_other_world(context, plan, changed), plan.by
     before, after = by.with_unit(plan.joint, plan.joint_se), by.with_unit(score.joint, score.joint_se)
     change = f"{by.change(score.joint - plan.joint, score.change_se)} {by.change_unit}".rstrip()
-    return f"{by.noun} of {plan_text} is {after} instead of {before} (change {change})."
+    return f"{plan_text} changes from {before} to {after} (by {change})."
 
 
 def joint_term(context: StageContext, sites: Sequence[Site]) -> tuple[CoverageTerm, View]:

@@ -227,8 +227,8 @@ def test_a_run_is_stopped_and_continued_and_becomes_outdated(desk: Client, tmp_p
         desk.ok("POST", "/api/what_if", {})
         desk.wait()
         assert re.match(
-            r"With obstacles, EGVS of the plan of 1 sensor is [\d,]+ ± [\d,]+ bit instead of [\d,]+ ± [\d,]+ bit "
-            r"\(change -?[\d,]+ ± [\d,]+ bit\)\.$", desk.ok("GET", "/api/what_if")["text"][0],
+            r"With obstacles, the plan of 1 sensor changes from [\d,]+ ± [\d,]+ bit to [\d,]+ ± [\d,]+ bit "
+            r"\(by -?[\d,]+ ± [\d,]+ bit\)\.$", desk.ok("GET", "/api/what_if")["text"][0],
         )  # fmt: skip
         desk.ok("PUT", "/api/obstacles", {"obstacles": []})
         assert not desk.project["run"]["plan_outdated"]

@@ -349,7 +349,7 @@ def test_planned_in_the_browser_is_ranked_the_same_by_the_command_line(
     tab.get_by_role("button", name="Parked lorry").click()
     wait_until(tab, lambda: len(state(tab)["project"]["obstacles"]) == 1)
     tab.get_by_role("button", name="What changes?").click()
-    tab.get_by_text(re.compile("^With obstacles, .* of the plan of 2 sensors is ")).wait_for(timeout=JOB_MS)
+    tab.get_by_text(re.compile("^With obstacles, the plan of 2 sensors changes from ")).wait_for(timeout=JOB_MS)
 
     go(tab, "Take along")
     for title, begin in (("Installation sheets", b"PK"), ("GeoPackage", b"SQLite")):
