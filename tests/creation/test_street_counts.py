@@ -16,7 +16,9 @@ from egvs.creation.street_counts import StreetCounts
 from egvs.formats import osm
 from egvs.report.sections import main_assumptions
 from egvs.scenario import loading
+from egvs.traffic.movements import MovementNames
 from tests.creation.overpass_server import SMALL
+from tests.creation.small_maps import MapWay, street, write_map
 from tests.installed import needs
 
 FROM_NORTH, FROM_SOUTH, FROM_EAST, FROM_WEST = "-1002#1", "1002#0", "-1001#1", "1001#0"
@@ -64,6 +66,37 @@ def rates(counts: StreetCounts, hour: int = 0) -> dict[tuple[str, str], float]:
 def test_same_movement_by_any_of_its_names(location: str, read: Read) -> None:
     counts = read("street,approach,turn,count", f"{location},120")
     assert rates(counts) == {(FROM_NORTH, TO_EAST): 120.0}  # a left turn of a southbound vehicle leads east
+
+
+@pytest.fixture(scope="module")
+def bend(tmp_path_factory: pytest.TempPathFactory) -> tuple[Streets, StreetJunction]:
+    """Main Street comes from the west and turns north; a slip road without a name goes on to the south."""
+    nodes = {1: (-150.0, 0.0), 2: (0.0, 0.0), 3: (0.0, 150.0), 4: (0.0, -150.0)}
+    ways = [
+        street("Main Street", 1, 2, road_class="primary"),
+        street("Main Street", 2, 3, road_class="primary"),
+        MapWay((2, 4), {"highway": "primary_link", "oneway": "no"}),
+    ]
+    path = write_map(tmp_path_factory.mktemp("bend") / "bend.osm", nodes, ways)
+    extract = osm.read_osm(path)
+    flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
+    _, streets, _ = street_network.build_network(extract, path, flags)
+    junction = junctions.largest_junctions(streets)[0]
+    assert junction is not None
+    return streets, junction
+
+
+def test_straight_on_is_the_turn_that_stays_on_the_street(bend: tuple[Streets, StreetJunction], tmp_path: Path) -> None:
+    path = tmp_path / "counts.csv"
+    path.write_text("street,approach,turn,count\nMain Street,W,straight,120\nslip road,S,left,30\n", encoding="utf-8")
+    counts = street_counts.read_junction_counts(path, *bend)
+    names = MovementNames(bend[0].network, bend[1].at_m, counts.flows)
+    described = {names.describe(flow.from_edge, flow.to_edge): flow.per_hour for flow in counts.flows}
+    assert described == {
+        "Main Street (west), left to Main Street": 120.0,
+        "slip road (south), left to Main Street": 30.0,
+    }
+    assert "Counted as straight on, since the street bends there: Main Street (west) left." in counts.notes
 
 
 def test_german_tables_mean_the_same(read: Read) -> None:

@@ -17,7 +17,7 @@ from egvs.core.grid import Roi
 from egvs.creation import sumo_network
 from egvs.creation.map_parts import RoadOptions
 from egvs.scenario.loading import scenario_from_dict
-from egvs.scenario.signal_config import SignalPhaseConfig
+from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.stages import check, traffic
 from egvs.traffic import directions, network, signal_descriptions, signal_plans, signals, sumo, sumo_folder
@@ -437,6 +437,25 @@ def test_approach_is_known_by_the_name_of_another_street_to_it():
         phase = SignalPhaseConfig.from_dict({"green": {name: ["all"]}, "green_s": 20})
         (index,) = signal_plans._green_links(phase, signal, "plan")
         assert links[index].approach.startswith(approach)
+
+
+def test_straight_on_is_the_turn_that_stays_on_the_street():
+    """Ring Road turns left at the signal; Mill Lane turns right off it."""
+    ways = (("left", "Ring Road"), ("right", "Mill Lane"))
+    north = np.array([0.0, -1.0])
+    links = tuple(
+        signals.Link(i, "Ring Road (north)", turn, "a", "Ring Road", north, side="north", target=out, way_out=out)
+        for i, (turn, out) in enumerate(ways)
+    )
+    signal = signals.Signal("s", ("s",), (0.0, 0.0), links, signals.Program("static", 0.0, ()))
+
+    def greens(movement):
+        plan = SignalConfig(type="fixed", phases=[{"green": {"north": movement}, "green_s": 20}])
+        return [phase.state for phase in signal_plans.make_program(plan, signal, "x").phases]
+
+    assert greens(["straight", "right"]) == greens(["left", "right"])
+    with pytest.raises(InputError, match=r"never green: Ring Road \(north\) right"):
+        greens(["straight"])
 
 
 def test_long_ids_are_shortened_and_still_accepted(tmp_path):

@@ -160,16 +160,24 @@ class StreetCounts:
 
 @dataclass(frozen=True)
 class _Row:
-    """A count: vehicles of some movements in an interval; ``start_min`` is None for vehicles per hour."""
+    """A count: vehicles of some movements in an interval; ``start_min`` is None for vehicles per hour.
+
+    ``turns`` are those of the table; empty for all.
+    """
 
     where: str
     title: str
     movements: tuple[ApproachMovement, ...]
-    is_split: bool
+    turns: tuple[str, ...]
     kind: str
     start_min: int | None
     minutes: int | None
     vehicles: float
+
+    @property
+    def is_split(self) -> bool:
+        """Whether the count is divided among several movements."""
+        return len(self.movements) > 1
 
 
 def read_junction_counts(path: Path, streets: Streets, junction: StreetJunction) -> StreetCounts:
@@ -305,6 +313,10 @@ def _notes(
 ) -> Iterator[str]:  # fmt: skip
     if split:
         yield f"Counts of several movements are divided by the assumed shares: {', '.join(split)}."
+    straight = [row for row in rows if "straight" in row.turns]
+    bends = {_movement_name(move) for row in straight for move in row.movements if move.turn not in row.turns}
+    if bends:
+        yield f"Counted as straight on, since the street bends there: {', '.join(sorted(bends))}."
     for hour in hours:
         if hour.partial_min:
             parts = [f"{name} ({minutes} min)" for name, minutes in hour.partial_min.items()]
@@ -373,7 +385,7 @@ def _parse_row(
         raise InputError(
             f"{where}: kind", f"expected a kind of the fleet, got {kind!r}", f"Kinds: {', '.join(sorted(kinds))}."
         )
-    movements, is_split = _find_movements(where, values, index, edges)
+    movements, turns = _find_movements(where, values, index, edges)
     title = " ".join(values[name] for name in LOCATION_COLUMNS if values.get(name))
     minutes = None
     if values.get("minutes"):
@@ -384,23 +396,23 @@ def _parse_row(
     if "count" in values:
         start_min = _parse_clock(f"{where}: start", values["start"]) if values.get("start") else None
         vehicles = _parse_count(f"{where}: count", values["count"])
-        yield _Row(where, title, movements, is_split, kind, start_min, minutes, vehicles)
+        yield _Row(where, title, movements, turns, kind, start_min, minutes, vehicles)
         return
     starts = [name for name, cell in values.items() if _CLOCK.fullmatch(name) and cell]
     counts = parse_each(starts, lambda name: _parse_count(f"{where}: {name}", values[name]), "counts")
     for name, vehicles in zip(starts, counts, strict=True):
-        yield _Row(where, title, movements, is_split, kind, _parse_clock(where, name), minutes, vehicles)
+        yield _Row(where, title, movements, turns, kind, _parse_clock(where, name), minutes, vehicles)
 
 
 def _find_movements(
     where: str, values: Mapping[str, str], index: ApproachIndex, edges: frozenset[str]
-) -> tuple[tuple[ApproachMovement, ...], bool]:
-    """Return the movements of a row, and whether its count is divided among several."""
+) -> tuple[tuple[ApproachMovement, ...], tuple[str, ...]]:
+    """Return the movements of a row, and the turns that it names."""
     named = [name for name in ("street", "approach", "lane_group", "edge", "from_edge") if values.get(name)]
     if not named:
         raise InputError(where, "has no location", "Give street and approach, lane_group, or edge.")
     if "edge" in named or "from_edge" in named:
-        return (_edge_movement(where, values, edges),), False
+        return (_edge_movement(where, values, edges),), ()
     street = ""
     turns: tuple[str, ...] = ()
     turn = values.get("turn", "").casefold()
@@ -423,7 +435,7 @@ def _find_movements(
                 raise InputError(f"{where}: turn", problem, "Leave it empty for all vehicles of the approach.")
             turns = (TURN_WORDS[turn],)
     movements = tuple(index.find(values.get("street") or street, side, turns, where))
-    return movements, len(movements) > 1
+    return movements, turns
 
 
 def _edge_movement(where: str, values: Mapping[str, str], edges: frozenset[str]) -> ApproachMovement:

@@ -27,6 +27,7 @@ from egvs.traffic.directions import arrival_side, compass
 from egvs.traffic.network import TURNAROUNDS, Edge, Network
 
 INSIDE = "inside"
+SLIP_ROAD = "slip road"
 ALIASES_OVER_M = 150.0
 """A street that becomes the approach within this distance of the junction is another name of the approach."""
 
@@ -54,6 +55,11 @@ def plain_text(name: str) -> str:
     """Return a name of a network on one line; netconvert escapes names twice."""
     printable = (character if character.isprintable() else " " for character in html.unescape(name))
     return " ".join("".join(printable).split())
+
+
+def street_name(edge: Edge) -> str:
+    """Return the street of an edge on one line: ``"slip road"`` for one without a name, else empty if it has none."""
+    return plain_text(edge.name) or (SLIP_ROAD if edge.type.endswith("_link") else "")
 
 
 class Arm(NamedTuple):
@@ -116,8 +122,8 @@ class ApproachNames:
         return arrival_side(self.heading(edge_id))
 
     def street(self, edge_id: str) -> str:
-        """Return the street of an edge on one line; empty if it has none."""
-        return plain_text(self._edges[edge_id].name)
+        """Return the street of an edge, see :func:`street_name`."""
+        return street_name(self._edges[edge_id])
 
     def aliases(self, edge_id: str) -> tuple[str, ...]:
         """Return the other streets that lead to the end of an edge, while a single road does, the nearest first."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 from egvs.core.errors import InputError
@@ -131,6 +131,28 @@ def list_approaches(turns: Mapping[str, Iterable[str]]) -> str:
     return "; ".join(f"{name} ({text})" if text else name for name, text in texts.items())
 
 
+def follow_bend(turns: Iterable[str], ways: Set[tuple[str, str]], street: str) -> tuple[str, ...]:
+    """Return turns of an approach; without a way straight on, "straight" is the only turn that stays on the street.
+
+    Parameters
+    ----------
+    turns
+        Values of :data:`~egvs.traffic.directions.TURNS`.
+    ways
+        Turn and street of each way out of the junction.
+    street
+        Street of the approach.
+
+    >>> follow_bend(["straight"], {("left", "Ring Road"), ("right", "Mill Lane")}, "Ring Road")
+    ('left',)
+    """
+    bends = {turn for turn, way_out in ways if street and way_out == street} - {U_TURN}
+    if any(turn == "straight" for turn, _ in ways) or len(bends) != 1:
+        return tuple(turns)
+    (bend,) = bends
+    return tuple(bend if turn == "straight" else turn for turn in turns)
+
+
 @dataclass(frozen=True)
 class ApproachMovement:
     """A movement of a junction.
@@ -145,6 +167,8 @@ class ApproachMovement:
         The edges to the junction, and the direction (2,) of arrival.
     aliases
         Other streets that lead to the approach.
+    way_out
+        Street on which the vehicles leave; may be empty.
     """
 
     flow: CountConfig
@@ -154,6 +178,7 @@ class ApproachMovement:
     edges: tuple[Edge, ...]
     heading: FloatArray
     aliases: tuple[str, ...] = ()
+    way_out: str = ""
 
     @property
     def approach_title(self) -> str:
@@ -190,11 +215,8 @@ class ApproachIndex:
         for flow in flows:
             movement = names.movement(flow.edge or flow.from_edge or "", flow.to_edge)
             side = arrival_side(movement.heading)
-            movements.append(
-                ApproachMovement(
-                    flow, side, movement.street, movement.turn, movement.approach, movement.heading, movement.aliases
-                )
-            )
+            edges, street, heading, turn, aliases, way_out = movement
+            movements.append(ApproachMovement(flow, side, street, turn, edges, heading, aliases, way_out))
         return cls(tuple(movements))
 
     def parse_approach(self, text: str, where: str) -> tuple[str, str]:
@@ -229,7 +251,7 @@ class ApproachIndex:
             Side on which the vehicles arrive; any if None. Without an approach on exactly this side, one on a
             neighbouring side is taken.
         turns
-            Turns; any if empty.
+            Turns; any if empty. Without a way straight on, "straight" is the turn that stays on the street.
         where
             File and line, for messages.
 
@@ -251,6 +273,7 @@ class ApproachIndex:
         if len(approaches) > 1:
             problem = f"{words!r} may be {' or '.join(approaches)}"
             raise InputError(where, problem, f"Give street and approach. {self.hint}")
+        turns = follow_bend(turns, {(move.turn, move.way_out) for move in candidates}, candidates[0].street)
         moves = [move for move in candidates if not turns or move.turn in turns]
         missing = sorted(set(turns) - {move.turn for move in moves})
         if missing:

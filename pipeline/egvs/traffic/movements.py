@@ -18,7 +18,7 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.scenario.traffic_config import CountConfig
-from egvs.traffic.approach_names import ApproachNames, plain_text
+from egvs.traffic.approach_names import ApproachNames, street_name
 from egvs.traffic.demand import RouteFinder
 from egvs.traffic.directions import TURNS, U_TURN
 from egvs.traffic.network import CAR, Edge, Network
@@ -188,7 +188,7 @@ class MovementNames:
 
 def _street(edge: Edge) -> str:
     """Return the name of an edge's street on one line."""
-    return plain_text(edge.name) or _UNNAMED_STREET
+    return street_name(edge) or _UNNAMED_STREET
 
 
 def _turn_between(before: FloatArray, after: FloatArray) -> str:

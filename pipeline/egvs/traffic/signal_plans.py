@@ -37,6 +37,7 @@ from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
 from egvs.traffic import network
 from egvs.traffic.approaches import (
     TURN_WORDS,
+    follow_bend,
     list_approaches,
     names_approach,
     normalise_street,
@@ -213,9 +214,12 @@ def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str, stated: S
     green: set[int] = set()
     for approach, movements in phase.green.items():
         on_approach = _links_of_approach(approach, signal, where)
+        street = next((link.street for link in on_approach if link.edge), "")
+        ways = {(link.movement, link.way_out) for link in on_approach}
         for movement in movements:
             requested = " ".join(movement.split()).casefold()
             requested = _MOVEMENT_WORDS.get(requested, requested)
+            (requested,) = follow_bend([requested], ways, street)
             selected = [link for link in on_approach if requested in (_ALL, link.movement)]
             if requested == _ALL:
                 selected = [link for link in selected if link.movement != CROSSING]

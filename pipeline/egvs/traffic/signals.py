@@ -67,6 +67,8 @@ class Link:
         Edge to which it leads; empty for a crossing.
     aliases
         Other streets that lead to the approach.
+    way_out
+        Street of the target; may be empty.
     """
 
     index: int
@@ -80,6 +82,7 @@ class Link:
     side: str = ""
     target: str = ""
     aliases: tuple[str, ...] = ()
+    way_out: str = ""
 
     @property
     def title(self) -> str:
@@ -323,7 +326,10 @@ def _read_signal(
             street, side, aliases = approaches.street(start), approaches.side(start), approaches.aliases(start)
             if approaches.is_inside(start):
                 street, side, aliases = "", "", ()
-            link = Link(index, names[start], movement, start, street, heading, foes, yields_to, side, target, aliases)
+            link = Link(
+                index, names[start], movement, start, street, heading, foes, yields_to, side, target, aliases,
+                approaches.street(target),
+            )  # fmt: skip
         else:
             arm = approaches.crossed_arm(connection["to"])
             link = Link(index, names.get(arm.edge, arm.name), CROSSING, "", "", None, foes, yields_to, arm.side)
