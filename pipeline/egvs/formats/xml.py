@@ -283,19 +283,6 @@ def file_encoding(path: Path, name: Path | None = None) -> str:
     return encoding
 
 
-def copy_as_utf8(path: Path, to: Path) -> None:
-    """Write a copy of a file in UTF-8, without the declaration of another encoding."""
-    with open_bounded(path) as file, to.open("wb") as copy:
-        text = Utf8Reader(file, file_encoding(path))
-        start = text.read(_HEAD_BYTES)
-        while b"?>" not in start and (more := text.read(_HEAD_BYTES)):
-            start += more
-            limits.ELEMENT.check_bytes(path, len(start), "has an unterminated XML declaration")
-        copy.write(start.partition(b"?>")[2])
-        while chunk := text.read(1 << 20):
-            copy.write(chunk)
-
-
 class _BoundedReader(io.RawIOBase):
     """The content of a compressed file; InputError when it exceeds the limit."""
 

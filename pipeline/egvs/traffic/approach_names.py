@@ -27,7 +27,6 @@ from egvs.traffic.directions import arrival_side, compass
 from egvs.traffic.network import TURNAROUNDS, Edge, Network
 
 INSIDE = "inside"
-SLIP_ROAD = "slip road"
 ALIASES_OVER_M = 150.0
 """A street that becomes the approach within this distance of the junction is another name of the approach."""
 
@@ -59,7 +58,7 @@ def plain_text(name: str) -> str:
 
 def street_name(edge: Edge) -> str:
     """Return the street of an edge on one line: ``"slip road"`` for one without a name, else empty if it has none."""
-    return plain_text(edge.name) or (SLIP_ROAD if edge.type.endswith("_link") else "")
+    return plain_text(edge.name) or ("slip road" if edge.type.endswith("_link") else "")
 
 
 class Arm(NamedTuple):

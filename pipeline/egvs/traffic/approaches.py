@@ -147,9 +147,7 @@ def follow_bend(turns: Iterable[str], ways: Set[tuple[str, str]], street: str) -
     ('left',)
     """
     bends = {turn for turn, way_out in ways if street and way_out == street} - {U_TURN}
-    if any(turn == "straight" for turn, _ in ways) or len(bends) != 1:
-        return tuple(turns)
-    (bend,) = bends
+    (bend,) = bends if len(bends) == 1 and "straight" not in dict(ways) else {"straight"}
     return tuple(bend if turn == "straight" else turn for turn in turns)
 
 

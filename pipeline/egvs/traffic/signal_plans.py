@@ -214,12 +214,11 @@ def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str, stated: S
     green: set[int] = set()
     for approach, movements in phase.green.items():
         on_approach = _links_of_approach(approach, signal, where)
-        street = next((link.street for link in on_approach if link.edge), "")
         ways = {(link.movement, link.way_out) for link in on_approach}
         for movement in movements:
             requested = " ".join(movement.split()).casefold()
             requested = _MOVEMENT_WORDS.get(requested, requested)
-            (requested,) = follow_bend([requested], ways, street)
+            (requested,) = follow_bend([requested], ways, max(link.street for link in on_approach))
             selected = [link for link in on_approach if requested in (_ALL, link.movement)]
             if requested == _ALL:
                 selected = [link for link in selected if link.movement != CROSSING]

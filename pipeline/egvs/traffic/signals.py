@@ -326,10 +326,8 @@ def _read_signal(
             street, side, aliases = approaches.street(start), approaches.side(start), approaches.aliases(start)
             if approaches.is_inside(start):
                 street, side, aliases = "", "", ()
-            link = Link(
-                index, names[start], movement, start, street, heading, foes, yields_to, side, target, aliases,
-                approaches.street(target),
-            )  # fmt: skip
+            ends = side, target, aliases, approaches.street(target)
+            link = Link(index, names[start], movement, start, street, heading, foes, yields_to, *ends)
         else:
             arm = approaches.crossed_arm(connection["to"])
             link = Link(index, names.get(arm.edge, arm.name), CROSSING, "", "", None, foes, yields_to, arm.side)
