@@ -41,6 +41,7 @@ def imported_names(name: str) -> set[str]:
 # ---- imports
 
 
+@pytest.mark.slow
 @needs(*EXTENSIONS)
 def test_import_contracts_hold(capsys: pytest.CaptureFixture[str]) -> None:
     broken = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)

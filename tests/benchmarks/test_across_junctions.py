@@ -175,6 +175,7 @@ def test_candidates_stand_at_their_height_where_the_ground_is_flat() -> None:
         assert site.pose.z_m == height_m
 
 
+@pytest.mark.slow
 def test_no_pole_is_in_the_building_or_outside_the_surroundings(mini: Path) -> None:
     free = candidates.free_locations(build_scene(load(mini)), None, (2.0, 4.0))
     x, y = free.T
@@ -182,6 +183,7 @@ def test_no_pole_is_in_the_building_or_outside_the_surroundings(mini: Path) -> N
     assert x.min() == -12.0 and x.max() == 52.0 and y.min() == -22.0 and y.max() == 22.0
 
 
+@pytest.mark.slow
 def test_poles_are_next_to_lanes() -> None:
     scenario = load(SCENARIOS / "hill")
     roads = sumo_folder.read_network(scenario)
@@ -555,6 +557,7 @@ def write_tables(folder: Path, out: Path) -> list[str]:
     return tables.write_tables(folder, out, read_protocol(), "p", resamples=200)
 
 
+@pytest.mark.slow
 def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
     printed = write_tables(made_up, tmp_path / "out")
     assert printed[0].startswith("2 junctions, detectors cluster; 4 parts, 0.07 hours on p, 2 cores")
@@ -601,6 +604,7 @@ def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
     assert rhos["training", "10"] == [1.0, 1.0]
 
 
+@pytest.mark.slow
 def test_aims_are_decided_when_all_held_out_junctions_are_there(made_up: Path, tmp_path: Path) -> None:
     protocol = read_protocol()
     (first, *_) = (junction for junction in protocol.junctions if junction.role == "held out")
@@ -669,6 +673,7 @@ def test_reliability_of_made_up_vehicles(tmp_path: Path, monkeypatch: pytest.Mon
         assert chances[members].mean() == pytest.approx(chance, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_tables_say_what_is_missing(made_up: Path, tmp_path: Path) -> None:
     info = PartInfo.read(made_up / "h.cluster.json")
     PartInfo(**{**vars(info), "again": ("a fault in the cable",), "skipped": ("nuc: no lanes",)}).write(made_up)
@@ -730,6 +735,7 @@ def test_tables_are_the_same_each_time(made_up: Path, tmp_path: Path) -> None:
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
 
 
+@pytest.mark.slow
 def test_tables_name_a_trial_and_several_sources(made_up: Path, tmp_path: Path) -> None:
     info = PartInfo.read(made_up / "h.cluster.json")
     PartInfo(**{**vars(info), "source": "other", "is_trial": True}).write(made_up)

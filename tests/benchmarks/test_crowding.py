@@ -23,6 +23,7 @@ def box(x, y, length=4.0, width=2.0, yaw=0.0):
     return (AT[0] + x, AT[1] + y, 0.75, length, width, 1.5, yaw)
 
 
+@pytest.mark.slow
 def test_a_queue_ahead_by_hand():
     # three cars in a line along x: 10 to 14, 16 to 20, 23 to 27
     queue = [box(12.0, 0.0), box(18.0, 0.0), box(25.0, 0.0)]
@@ -194,6 +195,7 @@ def test_gaps_agree_with_the_twin(seed):
         assert found.beside_gap_m[i] == pytest.approx(arc, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_shares_spacing_and_point_gaps_agree_with_the_twin(seed):
     rng = np.random.default_rng(100 + seed)

@@ -28,6 +28,7 @@ def boxes(*its: tuple[float, ...]) -> np.ndarray:
 # what was found
 
 
+@pytest.mark.slow
 def test_hits_by_hand() -> None:
     vehicles = [boxes(car(10.0), car(20.0)), boxes(), boxes(car(30.0), car(40.0), car(50.0))]
     found = [

@@ -170,6 +170,7 @@ def test_shipped_training_junctions_are_those_of_the_file():
     assert comparison.shipped_training_junctions() == training
 
 
+@pytest.mark.slow
 def test_trees_keep_the_directions_and_weight_junctions_equally(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")  # else scikit-learn starts a program that counts the cores
     # the same features; found always at the small junction, never at the one of ten times as many vehicles
@@ -184,6 +185,7 @@ def test_trees_keep_the_directions_and_weight_junctions_equally(monkeypatch):
     assert (model.chances(x) - model.chances(fewer)).mean() > 0.1
 
 
+@pytest.mark.slow
 def test_reliability_diagram_shows_every_bin(tmp_path: Path):
     curves = comparison.reliability({"one": sites(1), "two": sites(2)}, SHADOW)
     for number, parts in enumerate(curves.values(), start=1):

@@ -13,6 +13,7 @@ from egvs.core.progress import no_progress
 from egvs.studies.measurement import SettingRunner
 
 
+@pytest.mark.slow
 def test_recorded_traffic_does_not_scatter(mini: Path, tmp_path: Path) -> None:
     """Its traffic is the same with each seed, so the truth is the score of one run."""
     egvs.run(egvs.load(mini), tmp_path / "run")

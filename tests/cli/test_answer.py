@@ -42,6 +42,7 @@ def answer_lines(printed: str, error: str) -> list[str]:
     return [line for line in error.splitlines() if line and not STAGE_LINE.match(line)] + printed.splitlines()
 
 
+@pytest.mark.slow
 def test_the_answer_has_twelve_lines(six_poles: Path, tmp_path: Path, run_egvs) -> None:
     """With warnings, assumptions and six poles; the table has as many of them as there is room for."""
     with (six_poles / "sites.csv").open("a") as file:
@@ -81,6 +82,7 @@ def test_hints_at_finer_tilts_where_the_best_one_is_at_the_edge_or_between_coars
     assert finer_tilts(0.0, (0.0,)) == ""
 
 
+@pytest.mark.slow
 def test_no_fact_is_lost_in_the_report_and_with_verbose(six_poles: Path, tmp_path: Path, run_egvs) -> None:
     """Each warning, assumption and caveat, the lead, poles and scores."""
     with (six_poles / "sites.csv").open("a") as file:
@@ -116,6 +118,7 @@ def test_a_pole_in_a_lane_is_named_whatever_else_is_warned_of(
     assert f"\nCareful: {best} stands in a lane of Mill Lane.\n" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_vehicles_that_could_not_start_are_a_caveat_of_answer_report_and_plan(
     mini: Path, tmp_path: Path, run_egvs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -147,6 +150,7 @@ def test_plans_in_one_go(six_poles: Path, tmp_path: Path, run_egvs) -> None:
     assert len(plan.sensors) == 2
 
 
+@pytest.mark.slow
 def test_says_what_was_assumed(mini: Path, tmp_path: Path, run_egvs) -> None:
     settings = ("--set", "assumed=['traffic (guessed)', 'positions of the poles']")
     code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out", *settings)
@@ -215,6 +219,7 @@ def test_names_the_best_sites_by_egvs_where_another_score_prefers_others() -> No
     assert answer.order_by_egvs(agreed, {"gamma": 10.0}) == ""
 
 
+@pytest.mark.slow
 def test_details_only_on_request(mini: Path, tmp_path: Path, run_egvs) -> None:
     brief, error = run_egvs("run", mini, "--out", tmp_path / "out")[1:]
     verbose, verbose_error = run_egvs("run", mini, "--out", tmp_path / "out", "--verbose")[1:]

@@ -498,6 +498,7 @@ def record_what_lies_there(out: Path, stage: str) -> None:
     (out / "run.json").write_text(json.dumps(add_checksum(record)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

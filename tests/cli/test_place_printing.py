@@ -260,6 +260,7 @@ def test_files_come_last(capsys: pytest.CaptureFixture[str]) -> None:
     assert text.endswith(f"{LAST_LINES}runs/r/placement.parquet\nruns/r/report.html\n")
 
 
+@pytest.mark.slow
 def test_sensor_with_a_price_and_no_site_is_named(mini: Path, run_egvs: Any) -> None:
     scenario = mini / "scenario.toml"
     scenario.write_text(scenario.read_text() + '\n[costs]\nsensor = { small = 8000, "OS1-64" = 12000 }\n')

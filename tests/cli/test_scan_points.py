@@ -92,6 +92,7 @@ def test_rejects_clouds_whose_names_differ_in_case_only() -> None:
         scan._check_cloud_names(["pole_a", "POLE_a"])
 
 
+@pytest.mark.slow
 def test_the_run_stays_complete_and_its_report_shows_later_results(mini: Path, run_egvs: Call, tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert run_egvs("run", mini, "--out", run)[0] == 0

@@ -164,6 +164,7 @@ def test_noise_is_gaussian_along_the_beam(mini):
     assert (np.abs(off) > 1.96).mean() == pytest.approx(0.05, abs=0.01)
 
 
+@pytest.mark.slow
 def test_bytes_do_not_depend_on_order_or_threads(mini):
     scene = build_scene(mini, "effects.dropout.share=0.2", "effects.divergence.sub_beams=7")
     scanner, random = Scanner(scene, full_sweep=True), np.random.default_rng(1)

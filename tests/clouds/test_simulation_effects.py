@@ -108,6 +108,7 @@ def test_cumulated_weights_close_to_one_are_one(mini):
     assert _cumulate_weights(beam, weight)[2] == 1.0
 
 
+@pytest.mark.slow
 def test_foliage_returns_some_beams_and_transmits_others(mini):
     tree = feature(
         {"type": "Polygon", "coordinates": [[[13, -12], [15, -12], [15, -4], [13, -4], [13, -12]]]},
@@ -217,6 +218,7 @@ def test_vehicle_draws_are_even_and_fixed_by_name_and_seed():
     assert abs((draws < 0.12).mean() - 0.12) < 4 * math.sqrt(0.12 * 0.88 / 2000)
 
 
+@pytest.mark.slow
 def test_points_on_vehicles_are_those_that_scores_expect(mini):
     """Windows return less and the rest of a body more than the formula of scores; the sum is the same."""
     rated = ("effects.range_limit={rated_range_m=40, rated_reflectivity=0.1}",)

@@ -191,6 +191,7 @@ def code_lines(path: Path) -> int:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MOST_LINES)
 def test_source_behind_stage_key_stays_small(name: str) -> None:
     stage = stage_registry.stage(name)

@@ -60,6 +60,7 @@ def test_error_of_full_disk_names_the_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_removes_temporary_folders_of_killed_programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from tests.processes import python

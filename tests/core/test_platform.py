@@ -70,6 +70,7 @@ def test_all_modules_can_be_imported() -> None:
             importlib.import_module(module.name)
 
 
+@pytest.mark.slow
 def test_portable_suite_has_tests_of_what_differs_between_systems() -> None:
     used_by = {"egvs.core.files", "egvs.core.resource_usage", "egvs.runs.locks", "egvs.formats.reader_process"}
     assert {"egvs.core.platform", *used_by} <= platform_modules()

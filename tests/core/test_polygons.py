@@ -116,6 +116,7 @@ def test_pairs_of_one_file_are_added_up(monkeypatch: pytest.MonkeyPatch, work, w
             work(count)
 
 
+@pytest.mark.slow
 def test_dense_lines_and_small_bad_rings_do_not_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(limits.EDGE_PAIRS.name, "10")
     count = PairCount()
@@ -136,6 +137,7 @@ def test_parts_are_repaired_one_by_one() -> None:
     assert repair_polygon(mixed, "a").area == 28 + 2
 
 
+@pytest.mark.slow
 def test_accepts_long_valid_shapes() -> None:
     check_crossings([houses(40, 40)], "tiles")
     check_edge_pairs(shapely.LineString([(i * 0.01, math.sin(i * 0.001)) for i in range(50_000)]), "dense lane", 1.6)

@@ -58,6 +58,7 @@ sumo.run_program("sumo", [], Path(sys.argv[1]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not LINUX, reason="elsewhere the launcher watches a pipe")
 def test_sumo_ends_with_a_killed_parent(tmp_path, monkeypatch):
     os.mkfifo(tmp_path / "alive")

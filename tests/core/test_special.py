@@ -78,6 +78,7 @@ def test_values_at_quarter_turns_are_exact() -> None:
     np.testing.assert_array_equal(special.sindg(90.0 * quarters), np.array([0.0, 1.0, 0.0, -1.0])[quarters % 4])
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_scipy_is_imported_by_the_first_call() -> None:
     code = "import sys; from egvs.core.special import cosdg; assert 'scipy' not in sys.modules; print(cosdg(0.0))"

@@ -52,6 +52,7 @@ def test_only_stretches_above_the_clearance_have_a_deck() -> None:
     assert bridge_decks("<net/>", low, 0.0) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_bridge_over_a_valley_is_a_deck_and_the_ground_goes_below(tmp_path: Path) -> None:
     from shapely.geometry import box

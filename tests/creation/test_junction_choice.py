@@ -61,6 +61,7 @@ def test_takes_junction_at_point_then_near_signals_then_the_nearest(
     assert not any("has signals" in note for note in summary.notes)
 
 
+@pytest.mark.slow
 def test_largest_junction_without_any_signals_has_a_note(tmp_path: Path) -> None:
     notes = create(tmp_path, None, signals=False).notes
     assert (
@@ -69,10 +70,12 @@ def test_largest_junction_without_any_signals_has_a_note(tmp_path: Path) -> None
     )
 
 
+@pytest.mark.slow
 def test_junction_without_signals_at_the_point_has_no_note(tmp_path: Path) -> None:
     assert not any("signals" in note for note in create(tmp_path, (60.0, 0.0), signals=False).notes)
 
 
+@pytest.mark.slow
 def test_point_far_from_all_junctions_is_an_error_that_names_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         create(tmp_path, (180.0, 100.0))
@@ -114,6 +117,7 @@ def test_poles_are_spread_over_the_arms_of_a_fork(tmp_path: Path) -> None:
 CROSSING = {"highway": "traffic_signals", "crossing": "traffic_signals"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distance_m", [150.0, 400.0])
 def test_signals_of_a_pedestrian_crossing_are_no_junction(tmp_path: Path, distance_m: float) -> None:
     """The T-junction without signals is the junction, also where the crossing is too far away for its surroundings."""
@@ -126,6 +130,7 @@ def test_signals_of_a_pedestrian_crossing_are_no_junction(tmp_path: Path, distan
     assert (summary.junction.arms, summary.junction.lanes_in) == (3, 3)
 
 
+@pytest.mark.slow
 def test_carriageways_of_divided_roads_are_one_arm_each(tmp_path: Path) -> None:
     """Two divided roads cross: eight one-way streets, four arms."""
     nodes = {1: (-300.0, -6.0), 2: (300.0, -6.0), 3: (300.0, 6.0), 4: (-300.0, 6.0)}
@@ -156,6 +161,7 @@ def test_lane_for_turning_belongs_to_the_arm_of_its_road(tmp_path: Path) -> None
     assert (summary.junction.arms, summary.junction.lanes_in) == (3, 4)
 
 
+@pytest.mark.slow
 def test_road_that_becomes_divided_is_no_junction(tmp_path: Path) -> None:
     nodes = {1: (-300.0, 0.0), 2: (0.0, 0.0), 3: (30.0, 6.0), 4: (300.0, 6.0), 5: (30.0, -6.0), 6: (300.0, -6.0)}
     nodes |= {7: (-200.0, 0.0), 8: (-200.0, 150.0)}

@@ -36,6 +36,7 @@ def test_crossroads_has_a_zone_of_each_kind_on_each_side(made: tuple[Path, tuple
     assert len(names) == len(made[1])
 
 
+@pytest.mark.slow
 def test_zones_lie_where_their_names_say(made: tuple[Path, tuple[Zone, ...]]) -> None:
     """One lane of 3.2 m leads in from each side, so a stop line has 32 m2."""
     area = {zone.name: zone.area for zone in made[1]}

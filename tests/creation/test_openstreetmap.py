@@ -110,6 +110,7 @@ def test_heights_by_source(made: Made) -> None:
     assert heights["pole"] == {"default": 3}
 
 
+@pytest.mark.slow
 def test_counts_changed_and_dropped_objects(made: Made) -> None:
     counted = made[1].statics.counts
     assert counted.unreadable == {"height": 1}
@@ -276,6 +277,7 @@ def test_each_count_has_its_movement_in_words(made: Made) -> None:
     assert ["East Street (west)", "right", "North Street"] in words
 
 
+@pytest.mark.slow
 def test_printed_solids_are_those_of_the_check(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
     new_summary.print_new_scenario(made[1])
     printed = re.search(r"^solids +(\d+) objects \((\d+) solids", capsys.readouterr().out, re.MULTILINE)
@@ -407,6 +409,7 @@ def test_real_town(town: Made) -> None:
     check_sites(folder, 12)
 
 
+@pytest.mark.slow
 def test_real_town_is_in_network_frame(town: Made) -> None:
     import sumolib
 

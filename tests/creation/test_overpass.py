@@ -206,6 +206,7 @@ def check_rejected(outcome: tuple[int, str, str], start: str, expected: str) -> 
     assert "Traceback" not in error
 
 
+@pytest.mark.slow
 def test_server_that_does_not_answer_gives_one_message(
     tmp_path: Path, run_egvs: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

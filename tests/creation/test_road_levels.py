@@ -155,6 +155,7 @@ def make_decks(tags: dict[str, str]) -> list[MappedSolid]:
     return list(solids.make_decks([way], {1: (0.0, 0.0), 2: (50.0, 0.0)}, ImportCounts(), PairCount()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tags", "title", "decks"),
     [
@@ -170,11 +171,13 @@ def test_road_on_another_level_is_left_out(tmp_path: Path, tags: dict[str, str],
     assert (ids(others.roads), others.road_titles, ids(others.decks)) == ([9002], [title], decks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tags", [{}, {"tunnel": "building_passage"}, {"bridge": "no"}, {"layer": "0"}])
 def test_road_at_ground_level_stays(tmp_path: Path, tags: dict[str, str]) -> None:
     assert other_levels(with_flyover(**tags).write(tmp_path / "town.osm")) == road_levels.OtherLevels()
 
 
+@pytest.mark.slow
 def test_street_that_leaves_over_a_river_stays(tmp_path: Path) -> None:
     town = Extract().draw(9001, [1, (20, 20)], highway="primary")
     town.draw(9002, [900101, (60, 60)], highway="primary", bridge="yes", layer="1")
@@ -182,6 +185,7 @@ def test_street_that_leaves_over_a_river_stays(tmp_path: Path) -> None:
     assert other_levels(town.write(tmp_path / "river.osm")) == road_levels.OtherLevels()
 
 
+@pytest.mark.slow
 def test_junction_on_a_bridge_loses_the_road_below(tmp_path: Path) -> None:
     town = with_flyover().tag(1001, bridge="yes", layer="1").tag(1002, bridge="yes", layer="1")
     others = other_levels(town.write(tmp_path / "above.osm"))
@@ -197,6 +201,7 @@ def test_junction_on_a_bridge_becomes_a_scenario(tmp_path: Path) -> None:
     assert not decks_of(tmp_path / "above")
 
 
+@pytest.mark.slow
 def test_motorway_below_a_street_of_the_junction_is_left_out(tmp_path: Path) -> None:
     """Street 1001 stays, although it is the bridge: it belongs to the junction."""
     town = Extract().tag(1001, bridge="yes", layer="1")
@@ -205,6 +210,7 @@ def test_motorway_below_a_street_of_the_junction_is_left_out(tmp_path: Path) -> 
     assert (ids(others.roads), others.road_titles, ids(others.decks)) == ([9001], ["A 4 (layer 0)"], [])
 
 
+@pytest.mark.slow
 def test_underpass_that_starts_in_the_region_is_left_out(tmp_path: Path) -> None:
     town = Extract().draw(9001, [1, (-25, -8)], highway="primary")
     town.draw(9002, [900101, (0, -5), (25, -8)], highway="primary", tunnel="yes", layer="-1", name="Underpass")
@@ -212,6 +218,7 @@ def test_underpass_that_starts_in_the_region_is_left_out(tmp_path: Path) -> None
     assert others.road_titles == ["Underpass (tunnel)"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tags", "decks"),
     [

@@ -129,6 +129,7 @@ def carries_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: capacity)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("carries_everything")
 def test_poles_stand_around_the_ring_at_all_arms(tmp_path: Path) -> None:
     summary = create_scenario(tmp_path / "out", ring_map(tmp_path / "ring.osm"), at=degrees((0.0, 0.0)))
@@ -142,6 +143,7 @@ def test_poles_stand_around_the_ring_at_all_arms(tmp_path: Path) -> None:
     assert len(quadrants) == 4 and min(quadrants.values()) >= 2
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("carries_everything")
 def test_entry_of_a_ring_larger_than_the_region_has_a_note(tmp_path: Path) -> None:
     path = ring_map(tmp_path / "large.osm", radius_m=80.0)

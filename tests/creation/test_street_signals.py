@@ -84,6 +84,7 @@ def check_program(signal: Signal) -> None:
     assert sum(phase.max_s or phase.duration_s for phase in signal.program.phases) <= CYCLE_S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("walk", "gap_m", "number"), [(False, 24.0, 1), (False, WIDE_M, 2), (True, WIDE_M, 2)])
 def test_signals_at_stop_lines_become_one_signal(tmp_path: Path, walk: bool, gap_m: float, number: int) -> None:
     made = build(tmp_path, AT_STOP_LINES, walk=walk, gap_m=gap_m)
@@ -107,6 +108,7 @@ def test_signals_at_stop_lines_become_one_signal(tmp_path: Path, walk: bool, gap
     assert any({"Gate (north)", "Gate (south)"} <= approaches for approaches in together)
 
 
+@pytest.mark.slow
 def test_plan_states_the_outer_approaches(tmp_path: Path) -> None:
     """The street between the carriageways has green with the movements that lead to it."""
     (signal,) = read_signals(tmp_path, build(tmp_path, AT_STOP_LINES))
@@ -137,6 +139,7 @@ def test_signal_on_one_of_three_approaches_leaves_junction_uncontrolled(tmp_path
     assert not read_signals(tmp_path, build(tmp_path, {17: CROSSWALK}, two_way=True))
 
 
+@pytest.mark.slow
 def test_node_inside_a_junction_without_signal_is_named(tmp_path: Path) -> None:
     """The map lacks the signal of the southern carriageway."""
     made = build(tmp_path, {6: SIGNAL, 10: SIGNAL, 11: SIGNAL})
@@ -207,6 +210,7 @@ def test_untouched_tables_change_nothing(made_scenario: Path, tmp_path: Path) ->
     assert any("traffic" in entry for entry in scenario.assumed)
 
 
+@pytest.mark.slow
 def test_edited_tables_are_used_and_stay(made_scenario: Path, tmp_path: Path, run_egvs: Any) -> None:
     shutil.copytree(made_scenario, tmp_path / "made")
     counts, signals_table = tmp_path / "made" / "counts.csv", tmp_path / "made" / "signals.csv"

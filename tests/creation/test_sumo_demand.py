@@ -44,6 +44,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "source"),
     [(["run.sumocfg"], "sumocfg"), (["streets.net.xml.gz", "plain.rou.xml"], "routes")],

@@ -98,6 +98,7 @@ def divided_road() -> tuple[MapDraft, dict[str, int]]:
     return draft, ways
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("walk", [False, True])
 def test_restriction_inside_junction_holds(walk: bool) -> None:
     draft, ways = divided_road()
@@ -113,6 +114,7 @@ def test_restriction_inside_junction_holds(walk: bool) -> None:
     assert walkways[0].crossings == walkways[1].crossings and bool(walkways[0].crossings) == walk
 
 
+@pytest.mark.slow
 def test_restriction_between_objects_with_negative_ids_holds() -> None:
     """Editors give new objects negative numbers: edge -11 is way -11, not way 11 against its direction."""
     draft, ways = divided_road()
@@ -132,6 +134,7 @@ def test_restriction_between_objects_with_negative_ids_holds() -> None:
     assert (f"-{ways['north']}", f"-{ways['south']}") in turns and len(turns) == len(edge_turns(build(made)))
 
 
+@pytest.mark.slow
 def test_restriction_over_way_inside_junction_holds() -> None:
     """From the north to the east is forbidden; from the west to the east is not."""
     draft, ways = divided_road()
@@ -142,6 +145,7 @@ def test_restriction_over_way_inside_junction_holds() -> None:
     assert (str(ways["from west"]), str(ways["to east"])) in turns
 
 
+@pytest.mark.slow
 def test_repaired_network_is_otherwise_the_same() -> None:
     draft, ways = divided_road()
     free = build(draft.extract())
@@ -153,6 +157,7 @@ def test_repaired_network_is_otherwise_the_same() -> None:
     assert 'type="actuated"' in made.text and "minDur" in made.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tags", "is_open", "expected"),
     [
@@ -174,6 +179,7 @@ def test_restrictions_that_a_network_cannot_keep_are_named(tags: dict[str, str],
     assert notes(made)[-1] == f"Turn restrictions that hold {expected}: 1 (relation {relation})."
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("via", [None, (0.0, ARM_M)])
 def test_restriction_whose_streets_do_not_meet_at_its_node_is_named(via: XY | None) -> None:
     draft, ways = divided_road()
@@ -184,6 +190,7 @@ def test_restriction_whose_streets_do_not_meet_at_its_node_is_named(via: XY | No
     assert note.endswith(f"1 (relation {relation}).")
 
 
+@pytest.mark.slow
 def test_restriction_without_a_target_is_named() -> None:
     draft, ways = divided_road()
     relation = draft.restrict("no_left_turn", ways["middle"], draft.via((0.0, -APART_M)), ways["to east"])
@@ -192,6 +199,7 @@ def test_restriction_without_a_target_is_named() -> None:
     assert note.startswith("Turn restrictions whose streets do not meet") and f"(relation {relation})" in note
 
 
+@pytest.mark.slow
 def test_only_permitted_way_may_be_no_street() -> None:
     """All turns would be closed; the footway is drawn to the middle of the junction."""
     draft, ways = divided_road()
@@ -202,6 +210,7 @@ def test_only_permitted_way_may_be_no_street() -> None:
     assert (str(ways["from west"]), str(ways["to east"])) in edge_turns(made)
 
 
+@pytest.mark.slow
 def test_turn_that_is_forbidden_at_red_is_open() -> None:
     """netconvert would close it."""
     draft, ways = divided_road()

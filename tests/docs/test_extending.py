@@ -99,6 +99,7 @@ def test_an_effect_of_another_package_acts(mini: Path, tmp_path: Path) -> None:
     assert all(0 < less < score for less, score in zip(thinned, plain, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_an_effect_of_another_package_is_listed_and_checked(mini: Path, tmp_path: Path) -> None:
     beside = install(package("An effect"), tmp_path / "installed")

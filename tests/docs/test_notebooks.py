@@ -49,6 +49,7 @@ def test_there_are_notebooks() -> None:
     assert "map-to-decision" in NAMES
 
 
+@pytest.mark.slow
 def test_paper_counts_every_beam() -> None:
     """The paper's score has no losses of returns, which act here by default."""
     source = next(cell.source for cell in read("paper").cells if "settings = [" in cell.source)

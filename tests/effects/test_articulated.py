@@ -83,6 +83,7 @@ def test_rear_part_settles_at_the_analytic_angle_on_a_circle(tmp_path, turn):
     assert turn * angle[-50:] == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.slow
 @given(st.floats(-3.1, 3.1), st.floats(-3, 3), st.floats(0.01, 5), st.floats(0.5, 12))
 def test_analytic_step_agrees_with_many_small_steps(heading, direction, way, axle):
     """The closed form against a plain integration of d theta = sin(psi - theta) ds / d (Heun, 4000 steps)."""
@@ -163,6 +164,7 @@ def test_parts_follow_the_slope_of_a_finished_file(tmp_path):
     assert rear["z_m"] == pytest.approx(100 + GRADE * front_x - middle * math.sin(p) + 3.1 / 2, abs=2e-6)
 
 
+@pytest.mark.slow
 def test_parts_are_in_line_on_a_hill(hill_run):
     """Composition: each part stands on the grade by itself, behind the one that pulls it."""
     r = hill_run[1]

@@ -118,6 +118,7 @@ def test_neutral_parameters_give_the_plain_score(score_run: tuple[Path, Path], s
     np.testing.assert_array_equal(score_hits(score_run, settings), score_hits(score_run, []))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("series", WORSE_AND_WORSE.values(), ids=WORSE_AND_WORSE.keys())
 def test_worse_conditions_never_raise_a_score(score_run: tuple[Path, Path], series: list[str]) -> None:
     scores = np.array([scored(score_run, [setting])[0]["egvs"] for setting in series])
@@ -300,6 +301,7 @@ def read_score_rows(out: Path) -> list[Any]:
     return table.to_pylist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCAN_EFFECTS)
 def test_scan_effects_change_scores_and_write_weights(
     mini: Path, plain_scan_run: Path, tmp_path: Path, name: str
@@ -441,6 +443,7 @@ def test_foliage_combines_with_divergence(mini: Path, tmp_path: Path) -> None:
     assert result[28:40] == pytest.approx(1 - 3 / 12 * (1 - math.exp(-1)), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_foliage_combines_with_rain(mini: Path, tmp_path: Path) -> None:
     folder = one_beam_scene(mini, prism(10, -2, 14, 2, 1, 5, "tree_crown"))
     wet = "effects.rain.rate_mm_h=50"
@@ -508,6 +511,7 @@ IDLE_TRAFFIC = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("effects", IDLE_TRAFFIC.values(), ids=IDLE_TRAFFIC.keys())
 def test_idle_traffic_effects_do_not_change_the_traffic(flat_road, plain_traffic, tmp_path, effects):
@@ -592,6 +596,7 @@ def test_rejects_bad_parameters_of_traffic_effects(mini, run_egvs, tmp_path, ove
     assert code == 2 and re.search(message, " ".join(output.split())), output
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_hill_scenario_has_constant_traffic_of_all_kinds(tmp_path):
     scene = load(HILL, ["traffic.frames=120", "traffic.warmup_s=150", "tpog.blocks=1"])

@@ -91,6 +91,7 @@ def slow_return(range_m, weight, intensity, surface, pulse_ns, which):
     return main, merged_m, math.fsum(weight[i] * intensity[i] for i in echo) / intensity[main]
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["strongest", "first"]), st.sampled_from([1.0, 5.0, 12.0]))
 def test_agrees_with_slow_reference(seed: int, which: str, pulse_ns: float) -> None:
     rng = np.random.default_rng(seed)

@@ -220,6 +220,7 @@ def test_car_parked_in_half_of_the_frames_halves_shares_behind_it() -> None:
     assert share.tolist() == [1.0] * 17 + [0.5] * 23  # 16 voxels before it, and the first of its own
 
 
+@pytest.mark.slow
 def test_nearest_of_two_cars_counts_once() -> None:
     both = replay({0: [car(15, 0.25), car(5, 0.25)], 1: [car(15, 0.25)]}, 2)
     share = both.share(listed((0, 0.25, 1), [[20, 0, 0]]))
@@ -342,6 +343,7 @@ def test_hits_of_weighted_beams_agree_with_listed_crossings(
     assert 0 < walked.sum() < 0.995 * plain.borrowed_hits(beams).sum()
 
 
+@pytest.mark.slow
 def test_hits_of_a_run_agree_with_reference(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     settings = ("roi.voxel_m=1", "sensors.small.azimuth_step_deg=4", 'score.keep_visibility="all"', ON, ALL)
@@ -370,6 +372,7 @@ def test_hits_of_a_run_agree_with_reference(ran: tuple[Path, Path]) -> None:
     assert hidden > 1000
 
 
+@pytest.mark.slow
 def test_independent_method_is_a_product_over_voxels(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     scenario = egvs.load(folder, ["roi.voxel_m=1"])
@@ -393,6 +396,7 @@ def test_independent_method_is_a_product_over_voxels(ran: tuple[Path, Path]) -> 
 # Limits
 
 
+@pytest.mark.slow
 def test_without_vehicles_in_reach_scores_do_not_change(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     plain = parquet.read_artefact(out / "scores.parquet", "scores")[0]
@@ -473,6 +477,7 @@ def test_shares_do_not_depend_on_the_position_of_the_scene() -> None:
     assert len(set(here.tolist())) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("switch", [ON, INDEPENDENT])
 def test_occlusion_does_not_depend_on_threads(ran: tuple[Path, Path], switch: str) -> None:
     folder, out = ran
@@ -486,6 +491,7 @@ def test_occlusion_does_not_depend_on_threads(ran: tuple[Path, Path], switch: st
 # Which frames
 
 
+@pytest.mark.slow
 def test_subset_of_frames_is_reproducible(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     few = scores(folder, out, "effects.moving_occlusion.frames=9")
@@ -605,6 +611,7 @@ def test_share_needs_preparation() -> None:
 # The comparison
 
 
+@pytest.mark.slow
 def test_reports_the_error_of_the_independent_method(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     plain, framed, independent = scores(folder, out), scores(folder, out, ON), scores(folder, out, INDEPENDENT)

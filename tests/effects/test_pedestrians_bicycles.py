@@ -52,6 +52,7 @@ def test_number_of_motor_vehicles_is_constant_with_bicycles(hill_run):
     assert result["collisions"] == 0
 
 
+@pytest.mark.slow
 def test_every_bicycle_trip_starts_on_time(flat_road, tmp_path):
     scene = road_scenario(
         flat_road,
@@ -189,6 +190,7 @@ def write_user_demand(flat_road, folder):
     return keys | {"routes": ["own.rou.xml"], "vehicles": 4, "hold": "at_most"}
 
 
+@pytest.mark.slow
 def test_people_are_added_to_user_routes(flat_road, tmp_path):
     keys = write_user_demand(flat_road, tmp_path)
     result = run_stage(traffic, road_scenario(tmp_path, CROWD, **keys), tmp_path / "out")

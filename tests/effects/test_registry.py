@@ -103,6 +103,7 @@ def test_rejects_bad_parameters_of_plugin_effect(mini, package, tmp_path, settin
     assert (process.returncode, message in process.stderr) == (2, True), process.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_plugin_effect_is_listed_only_if_installed(mini, package, tmp_path):
     assert "half" in run_egvs(package, "effects").stdout.split()
@@ -194,6 +195,7 @@ def test_lists_broken_plugins(mini, tmp_path):
         assert named.returncode == 1 and f"p_{name}" in named.stderr and "Traceback" not in named.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_list_names_the_package_of_each_effect(mini, package):
     for arguments in ((), (mini,)):

@@ -174,6 +174,7 @@ def test_draped_scenario_runs_to_a_ranking(flat_road: Path, tmp_path: Path) -> N
     assert z == pytest.approx(expected, abs=0.02) and len(x) > 1000
 
 
+@pytest.mark.slow
 def test_far_point_of_a_terrain_costs_no_time(flat_road: Path) -> None:
     """The rim of the ground has a point each 50 m, but not on a side of 40,000 km."""
     roads = network.read_net_xml(flat_road / "road.net.xml")

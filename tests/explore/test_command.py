@@ -70,6 +70,7 @@ def test_says_what_simulated_flows_are_compared_with(
     assert code == 2 and f"10 frames; largest GEH against {source} 0.2" in err
 
 
+@pytest.mark.slow
 def test_address_is_printed_and_opened(run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
@@ -82,6 +83,7 @@ def test_address_is_printed_and_opened(run_egvs, mini: Path, tmp_path: Path, mon
     assert len(opened) == 3
 
 
+@pytest.mark.slow
 def test_starts_with_the_view_of_a_link(run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[tuple] = []
 
@@ -150,6 +152,7 @@ def test_invalid_options_give_one_message(
     assert not Path("runs").exists()
 
 
+@pytest.mark.slow
 def test_writes_page_file_without_serving(
     run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -173,6 +173,7 @@ def test_dark_page_has_dark_world(page: Page) -> None:
     assert {kind: mesh.color for kind, mesh in page.world.meshes.items()} == by_day
 
 
+@pytest.mark.slow
 def test_impossible_pose_has_no_score(page: Page) -> None:
     move_and_wait(page, "pole_a", Pose(16, 6, 3))
     assert page.controls.status.content.startswith("## no score")

@@ -57,6 +57,7 @@ def draw(session: Session, layer: str, pose: Pose) -> tuple[Scene, str]:
     return scene, drawing.draw_layer(context)
 
 
+@pytest.mark.slow
 def test_points_are_those_of_the_current_pose(session: Session) -> None:
     for pose in (Pose(10, 12, 3), Pose(25, 11, 4)):
         scene, legend = draw(session, "points_car", pose)

@@ -57,6 +57,7 @@ def test_candidates_have_the_scores_of_the_run(opened: Session) -> None:
 EFFECTS = (None, "effects.divergence={}", "effects.moving_occlusion={}", "effects.rain.rate_mm_h=20")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_moved_sensor_has_the_score_of_a_run_with_that_site(tmp_path: Path, effect: str | None) -> None:
     settings = [EVERY, *([effect] if effect else [])]
@@ -295,6 +296,7 @@ def test_best_additional_candidate_has_the_largest_gain(planned: tuple[Session, 
     assert math.isclose(plan.best_next[1], max(gains.values()), rel_tol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_refined_plan_has_its_refined_poses(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text(SITES)
@@ -308,6 +310,7 @@ def test_refined_plan_has_its_refined_poses(mini: Path, tmp_path: Path) -> None:
     assert plan.joint == placed.joint
 
 
+@pytest.mark.slow
 def test_plan_of_other_settings_is_ignored(mini: Path, tmp_path: Path) -> None:
     assert open_session(mini, (), tmp_path / "bare").plan is None
     egvs.place(egvs.load(mini, ["placement.count=1"]), tmp_path / "run")

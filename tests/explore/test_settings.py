@@ -32,6 +32,7 @@ def session(mini: Path, tmp_path: Path) -> Session:
     return open_session(mini, (), tmp_path / "run")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ANOTHER)
 def test_session_with_settings_has_the_scores_of_a_run(session: Session, mini: Path, tmp_path: Path, name: str) -> None:
     settings, overrides = ANOTHER[name]
@@ -50,6 +51,7 @@ def test_session_with_settings_has_the_scores_of_a_run(session: Session, mini: P
     assert settings.overrides(session.scenario) == tuple(sorted(overrides))
 
 
+@pytest.mark.slow
 def test_effect_can_be_switched_off(mini: Path, tmp_path: Path) -> None:
     rainy = open_session(mini, ["effects.rain.rate_mm_h=20"], tmp_path / "run")
     dry = Settings(None, "egvs", frozenset())
@@ -68,6 +70,7 @@ def test_unchanged_settings_give_the_initial_session(session: Session, tmp_path:
     assert Settings.from_scenario(session.scenario).overrides(session.scenario) == ()
 
 
+@pytest.mark.slow
 def test_only_stages_that_depend_on_a_setting_run(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -80,6 +83,7 @@ def test_only_stages_that_depend_on_a_setting_run(
     assert made == ["score"]
 
 
+@pytest.mark.slow
 def test_plan_with_other_gamma_has_its_joint_score(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text(FOUR_SITES)
     egvs.place(egvs.load(mini, ["placement.count=2"]), tmp_path / "run")

@@ -42,6 +42,7 @@ finite = st.floats(-1e6, 1e6, allow_nan=False)
 pitch = st.floats(-90, 90)
 
 
+@pytest.mark.slow
 @given(
     pose=st.builds(Pose, finite, finite, finite, finite, pitch, finite),
     gamma=st.none() | st.floats(1e-9, 1e9) | st.sampled_from((0.0, float("inf"))),

@@ -89,6 +89,7 @@ def test_view_of_a_tilted_sensor_begins_at_the_sensor_where_no_beam_meets_the_gr
     assert sum(point == (0.0, 0.0) for point in hole.exterior.coords[:-1]) == 1
 
 
+@pytest.mark.slow
 def test_drawing_has_sites_at_eastings_and_northings_with_labels(located: Path, tmp_path: Path) -> None:
     done = export_run(located, "dxf", out=tmp_path / "plan.dxf")
     assert done.reference == "ETRS89 / UTM zone 32N"

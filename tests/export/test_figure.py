@@ -87,6 +87,7 @@ def test_error_bar_is_one_standard_error_to_either_side() -> None:
     assert text.count('class="lead"') == 1
 
 
+@pytest.mark.slow
 @pytest.mark.system  # loading cairo asks the system where it is
 def test_pdf_contains_fonts(local: Path, tmp_path: Path) -> None:
     pytest.importorskip("cairosvg", reason="the extra egvs[figure] is not installed")

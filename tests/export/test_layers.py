@@ -15,6 +15,7 @@ from egvs.export.export import export_run
 from tests.scoring.test_periods import PERIODS
 
 
+@pytest.mark.slow
 def test_a_site_has_the_scores_of_each_period(mini: Path, tmp_path: Path) -> None:
     """One of them is called so that its columns could be taken for others."""
     file = mini / "scenario.toml"
@@ -47,6 +48,7 @@ def planned(local: Path, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_plan_is_a_layer_until_the_run_changes(planned: Path, tmp_path: Path, run_egvs: Call) -> None:
     code, output, _ = run_egvs("export", planned, "--to", "csv", "--out", tmp_path / "a")
     assert (code, "plan" in output.splitlines()[0]) == (0, False)

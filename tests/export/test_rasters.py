@@ -128,6 +128,7 @@ def test_cells_in_degrees_have_the_value_at_their_position(located: Path, tmp_pa
     assert checked > 300
 
 
+@pytest.mark.slow
 def test_scans_that_were_not_saved_need_unchanged_inputs(mini: Path, tmp_path: Path, run_egvs: Call) -> None:
     """A site that hangs elsewhere by now would be shown with views that its score does not say."""
     run = tmp_path / "run"
@@ -142,6 +143,7 @@ def test_scans_that_were_not_saved_need_unchanged_inputs(mini: Path, tmp_path: P
     assert run_egvs("export", run, "--to", "csv", "--out", tmp_path / "b")[0] == 0
 
 
+@pytest.mark.slow
 def test_sites_with_similar_names_have_separate_files(mini: Path, tmp_path: Path) -> None:
     """Signs that no file can have, capitals, and what pictures are called."""
     names = ["a.b", "A_B", "a_b_colours"]

@@ -119,6 +119,7 @@ FOOTPRINT_FORMATS = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(("to", "crs"), FOOTPRINT_FORMATS)
 def test_exported_footprints_are_the_same_solids(hill: Path, tmp_path: Path, to: str, crs: str) -> None:
@@ -131,6 +132,7 @@ def test_exported_footprints_are_the_same_solids(hill: Path, tmp_path: Path, to:
     assert expected["house"][2] == pytest.approx(107.6, abs=0.05)  # 6 m above the ground at x = 16
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(("to", "crs"), [*FOOTPRINT_FORMATS, ("csv", "scenario"), ("csv", "wgs84")])
 def test_exported_sites_are_the_same_sensors(hill: Path, tmp_path: Path, to: str, crs: str) -> None:
@@ -202,6 +204,7 @@ def test_rejects_other_z_datum(hill: Path, tmp_path: Path, properties: dict, mes
         Inputs(load(hill, [f'statics.footprints=["{tmp_path / "s.geojson"}"]'])).built_world  # noqa: B018
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_altitude_in_kml_is_above_the_ground(hill: Path, tmp_path: Path) -> None:
     """Google Earth shows a sensor at its altitude above the terrain; ``z_m`` is that of the world frame."""

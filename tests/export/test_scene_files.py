@@ -134,6 +134,7 @@ def test_exported_glb_opens_with_all_sites_and_solids(located: Path, tmp_path: P
     assert building.bounds[1, 2] == pytest.approx(6.0)  # vertices keep the axes of the world frame
 
 
+@pytest.mark.slow
 def test_exported_usd_has_the_poses(located: Path, tmp_path: Path) -> None:
     pytest.importorskip("pxr", reason="the extra egvs[usd] is not installed")
     from pxr import Usd, UsdGeom

@@ -108,6 +108,7 @@ def test_links_are_refused(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.slow
 def test_archives_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bomb = write_zip(tmp_path / "a.zip", {"zeros.txt": bytes(3_000_000)})
     assert bomb.stat().st_size < 10_000
@@ -125,6 +126,7 @@ def test_archives_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         pass
 
 
+@pytest.mark.slow
 def test_damaged_and_encrypted_archives(tmp_path: Path) -> None:
     path = write_zip(tmp_path / "a.zip", {"a.txt": "one " * 100})
     good = path.read_bytes()

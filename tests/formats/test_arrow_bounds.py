@@ -136,6 +136,7 @@ def test_long_text_in_each_row_is_not_repeated(tmp_path: Path) -> None:
     assert pa.total_allocated_bytes() - before < 10_000_000
 
 
+@pytest.mark.slow
 def test_rejects_columns_that_repeat_values(tmp_path: Path) -> None:
     path = tmp_path / "f.parquet"
     pq.write_table(fcd_table(), path, use_dictionary=False, column_encoding={"id": "DELTA_BYTE_ARRAY"})

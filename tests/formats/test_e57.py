@@ -65,6 +65,7 @@ def cartesian(*points: tuple[float, float, float], invalid: tuple[int, ...] = ()
 ONE_POINT = cartesian((1.0, 2.0, 3.0))
 
 
+@pytest.mark.slow
 def test_points_and_stations_follow_the_poses(tmp_path: Path) -> None:
     path = write_e57(
         tmp_path / "a.e57",
@@ -88,6 +89,7 @@ def test_invalid_points_are_dropped_and_counted(tmp_path: Path) -> None:
     assert (points.tolist(), dropped) == ([[1, 2, 3]], 1)
 
 
+@pytest.mark.slow
 def test_identity_poses_tell_no_station(tmp_path: Path) -> None:
     """Programs that join scans write such poses."""
     at_zero, at_five = (ONE_POINT, NO_TURN, (0, 0, 0)), (ONE_POINT, NO_TURN, (5, 0, 0))
@@ -105,6 +107,7 @@ def test_spherical_coordinates() -> None:
     np.testing.assert_allclose(points, [[0, 2, 0], [np.sqrt(3), 0, 1]], atol=1e-15)
 
 
+@pytest.mark.slow
 def test_large_scans_come_in_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     values = np.arange(1_200_000, dtype=float)
     columns = {f"cartesian{axis}": values for axis in "XYZ"}
@@ -117,6 +120,7 @@ def test_large_scans_come_in_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         read_points(path, "")
 
 
+@pytest.mark.slow
 def test_declared_reference_system(tmp_path: Path) -> None:
     scan = (ONE_POINT, NO_TURN, (0, 0, 0))
     assert e57.crs_of(write_e57(tmp_path / "a.e57", scan), "") is None

@@ -75,6 +75,7 @@ VIEWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("query", VIEWS)
 def test_view_of_a_geopackage_is_rejected(tmp_path: Path, query: str) -> None:
     path = points(tmp_path / "poles.gpkg")
@@ -87,6 +88,7 @@ def test_view_of_a_geopackage_is_rejected(tmp_path: Path, query: str) -> None:
         vector_files.read_gis_file(path, "Point")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", ["gpkg_contents", "gpkg_geometry_columns"])
 def test_endless_table_of_contents_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: str) -> None:
     monkeypatch.setenv(limits.READER_TIME.name, "5")
@@ -100,6 +102,7 @@ def test_endless_table_of_contents_ends(tmp_path: Path, monkeypatch: pytest.Monk
         vector_files.read_gis_file(path, "Point")
 
 
+@pytest.mark.slow
 def test_reads_layer_in_file_with_a_view(tmp_path: Path) -> None:
     path = points(tmp_path / "poles.gpkg")
     run_sql(
@@ -112,6 +115,7 @@ def test_reads_layer_in_file_with_a_view(tmp_path: Path) -> None:
     assert [feature["properties"]["site"] for feature in features] == ["a"]
 
 
+@pytest.mark.slow
 def test_geopackage_with_unsaved_changes_is_rejected(tmp_path: Path) -> None:
     """What is in the journal alone is no part of the file that the cache key counts."""
     path = points(tmp_path / "poles.gpkg")
@@ -131,6 +135,7 @@ def outcomes(path: Path, watched: Watched) -> dict[str, Any]:
     return blocks[0].values
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(sandbox.missing_protections()), reason="this system does not confine programs")
 def test_reader_reads_its_file_only(watched: Watched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))

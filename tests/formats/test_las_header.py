@@ -187,6 +187,7 @@ def test_flag_of_the_header_says_which_record_counts(tmp_path: Path) -> None:
     assert empty == by_keys
 
 
+@pytest.mark.slow
 def test_other_record_of_a_reference_system(tmp_path: Path) -> None:
     both: dict[str, Any] = {"keys": UTM_15, "wkt": WKT_UTM_FEET}
     other = other_point_cloud_crs(write_las(tmp_path / "a.las", **both, wkt_flag=True), "")
@@ -196,6 +197,7 @@ def test_other_record_of_a_reference_system(tmp_path: Path) -> None:
     assert other_point_cloud_crs(write_las(tmp_path / "d.las", keys=UTM_15, wkt="Local"), "") is None
 
 
+@pytest.mark.slow
 def test_texts_that_are_no_reference_system(tmp_path: Path) -> None:
     assert point_cloud_crs(write_las(tmp_path / "quotes.las", wkt='""'), "") is None
     with pytest.raises(InputError, match=r"local\.las: unknown coordinate reference system 'Local'"):
@@ -204,6 +206,7 @@ def test_texts_that_are_no_reference_system(tmp_path: Path) -> None:
         point_cloud_crs(write_las(tmp_path / "keys.las", keys={1024: 1, 3072: 5}), "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".las", pytest.param(".laz", marks=pytest.mark.system)])
 def test_noise_and_withheld_points_are_missing_returns(tmp_path: Path, suffix: str) -> None:
     """One point each: unclassified, ground, low noise, water, high noise, withheld, synthetic, overlap."""

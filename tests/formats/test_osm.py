@@ -132,6 +132,7 @@ def test_rejects_invalid_xml(tmp_path: Path, content: str, message: str) -> None
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_rejects_truncated_or_damaged_pbf(tmp_path: Path) -> None:
     path = pbf_of(SMALL, tmp_path / "a.osm.pbf")
     content = path.read_bytes()
@@ -143,6 +144,7 @@ def test_rejects_truncated_or_damaged_pbf(tmp_path: Path) -> None:
             osm.read_osm(path)
 
 
+@pytest.mark.slow
 def test_rejects_pbf_with_node_beyond_the_pole(tmp_path: Path) -> None:
     path = pbf_of(put(tmp_path, osm_xml('<node id="6" lat="91" lon="2"/>')), tmp_path / "a.osm.pbf", with_bounds=False)
     with pytest.raises(InputError, match=r"a\.osm\.pbf: node 6: lat: expected degrees from -90 to 90, got '91'"):
@@ -187,6 +189,7 @@ def test_reads_other_encodings(tmp_path: Path, declared: str, codec: str, packed
     assert osm.read_osm(tmp_path / "a.osm").ways[3].tags == {"name": "青梅街道"}
 
 
+@pytest.mark.slow
 def test_rejects_more_objects_than_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_MAX_MAP_OBJECTS", "10")
     pbf = pbf_of(SMALL, tmp_path / "a.osm.pbf")

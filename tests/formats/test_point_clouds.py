@@ -397,6 +397,7 @@ def test_rejects_laz_that_would_end_the_process(tmp_path: Path) -> None:
         read_points(path, "")
 
 
+@pytest.mark.slow
 @needs_laspy
 @pytest.mark.system
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory cannot be limited on this system")
@@ -449,6 +450,7 @@ def test_message_without_lazrs_says_how_to_install_it(tmp_path: Path, monkeypatc
 # --- in chunks ---
 
 
+@pytest.mark.slow
 @needs_laspy
 @pytest.mark.system
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
@@ -726,6 +728,7 @@ def test_formats_of_this_program_can_be_read() -> None:
         assert callable(readers.load_reader(reader).read)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_reading_imports_no_other_format(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"

@@ -94,6 +94,7 @@ def test_geoparquet_is_read_by_one_process(tmp_path: Path, monkeypatch: pytest.M
     assert len(started) == 1
 
 
+@pytest.mark.slow
 def test_xml_has_a_limit_of_elements(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.xml.gz"
     path.write_bytes(gzip.compress(b"<r>" + b"<a/>" * 100_001 + b"</r>"))

@@ -329,6 +329,7 @@ def _edit_archive(source: Path, target: Path, before: str, after: str) -> None:
             new.writestr(name, old.read(name).decode().replace(before, after))
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_number_of_rows_has_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A million rows in a few kilobytes; lines without values do not count, and need no memory."""

@@ -76,6 +76,7 @@ def candidates(folder: Path, name: str) -> tuple[sites.Site, ...]:
 
 
 # --- sites ---------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("epsg", [4326, 25832, 3857])
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_sites_are_in_the_world_frame_with_their_columns(located: Path, suffix: str, epsg: int) -> None:
@@ -130,6 +131,7 @@ def test_kml_altitudes_count_only_above_the_ground(located: Path) -> None:
         candidates(located, "poles.kml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["gpkg", "parquet"])
 def test_columns_of_other_programs_are_rejected_with_the_hint(located: Path, suffix: str) -> None:
     write(located / f"poles.{suffix}", frame_of({"site": ["a", "b"], "z_m": [3.0, 3.0], "heading": [0.0, 90.0]}))
@@ -223,6 +225,7 @@ def test_damaged_file_is_named(located: Path, suffix: str) -> None:
         candidates(located, f"poles.{suffix}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("suffix", "text"), [("dbf", b"City"), ("dbf", b"owner"), ("parquet", b"City")])
 def test_text_that_is_not_utf_8_is_rejected(located: Path, suffix: str, text: bytes) -> None:
     name = "poles.parquet" if suffix == "parquet" else "poles.shp"
@@ -233,12 +236,14 @@ def test_text_that_is_not_utf_8_is_rejected(located: Path, suffix: str, text: by
         candidates(located, name)
 
 
+@pytest.mark.slow
 def test_parquet_without_geometry_is_rejected(located: Path) -> None:
     pq.write_table(pa.table({"site": ["a"], "x_m": [1.0]}), located / "poles.parquet")
     with pytest.raises(InputError, match=r"poles\.parquet: the file cannot be read as GeoParquet \(KeyError\('geo'\)"):
         candidates(located, "poles.parquet")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["shp", "parquet"])
 def test_file_without_reference_system_is_rejected(located: Path, suffix: str) -> None:
     path = write(located / f"poles.{suffix}", frame_of(ROWS, epsg=4326 if suffix == "shp" else None))
@@ -271,6 +276,7 @@ def test_every_file_of_a_shapefile_is_an_input(located: Path) -> None:
 
 
 # --- footprints ----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [*FORMATS, "kml"])
 def test_footprints_are_in_the_world_frame(tmp_path: Path, suffix: str) -> None:
     frame = frame_of({"name": ["house", "shed"], "height_m": [6.0, 2.5], "base_m": [0.0, 0.5]}, epsg=25832)
@@ -284,6 +290,7 @@ def test_footprints_are_in_the_world_frame(tmp_path: Path, suffix: str) -> None:
     assert house.polygon.symmetric_difference(shapely.box(6, 8, 14, 16)).area < 0.02
 
 
+@pytest.mark.slow
 def test_geometry_columns_of_geoparquet_are_left_out(tmp_path: Path) -> None:
     path = write(tmp_path / "poles.parquet", frame_of(ROWS), write_covering_bbox=True, schema_version="1.1.0")
     assert "bbox" in pq.read_schema(path).names
@@ -292,6 +299,7 @@ def test_geometry_columns_of_geoparquet_are_left_out(tmp_path: Path) -> None:
     assert json.loads(document["crs"]["properties"]["name"])["id"]["code"] == 4326
 
 
+@pytest.mark.slow
 def test_geometries_of_geoparquet_are_bytes(tmp_path: Path) -> None:
     path = write(tmp_path / "poles.parquet", frame_of(ROWS))
     table = pq.read_table(path)

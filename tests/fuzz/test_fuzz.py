@@ -36,6 +36,7 @@ def test_each_format_with_limits_has_kinds() -> None:
     assert {kind for kinds in FORMATS.values() for kind in kinds} <= set(KINDS)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_mutants_of_some_kinds_give_no_fault(tmp_path: Path) -> None:
     """And a second call has nothing left to do."""

@@ -227,6 +227,7 @@ print(TriangleTree(ahead).nearest(np.zeros(3), np.arange(2, dtype=np.uint32), d)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_same_hits_without_compiler() -> None:
     done = run_python(INTERPRETED, NUMBA_DISABLE_JIT="1")

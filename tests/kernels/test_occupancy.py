@@ -321,6 +321,7 @@ def traffic_of(rng, frames, crowd=4):
     return np.array(frame, np.int64), np.array(values).reshape(-1, 8)
 
 
+@pytest.mark.slow
 def test_small_traffic_agrees_with_brute_force():
     """Overlapping vehicles count once a frame; blocks add up; row groups need not end where blocks do."""
     rng = np.random.default_rng(5)

@@ -175,6 +175,7 @@ def test_point_on_the_floor_is_inside_and_on_the_roof_outside():
     assert [abs(n) for n in turns] == [0, 1, 1, 0, 0]
 
 
+@pytest.mark.slow
 def test_smallest_triangles_of_the_lattice():
     """Twice the areas of the three parts around the point (0, 1) are 1, the smallest area that counts."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [-1, 3, 0]]) * occupancy.SNAP_M + [0.0, 0.0, 6.0]

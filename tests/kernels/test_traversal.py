@@ -288,6 +288,7 @@ def test_moving_ends_by_a_nanometre_changes_fragile_voxels_only(segment, by_star
         assert before ^ after <= by_chord | along_face | oracle.ambiguous(o, d, SHAPE, voxel_m)
 
 
+@pytest.mark.slow
 def test_fragile_segments_are_those_constructed():
     """Counted: random segments have none; each built one has, and moving it by a nanometre does change a voxel."""
     rng = np.random.default_rng(1)

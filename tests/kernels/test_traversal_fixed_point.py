@@ -249,6 +249,7 @@ def hard_beams():
 CASES = [*(in_voxels(entry) for entry in SOUND if is_near(entry, False)), *hard_beams()]
 
 
+@pytest.mark.slow
 def test_hard_beams_agree_with_rational_arithmetic():
     for o, d, shape, voxel_m in CASES:
         assert agrees_with_exact_march(traversal, o, d, shape, voxel_m)

@@ -53,6 +53,7 @@ def test_hits_and_weighted_hits_agree_with_rational_arithmetic(shape):
     assert np.array_equal(by_exact_traversal, expected_weighted)
 
 
+@pytest.mark.slow
 def test_amount_falls_by_the_share_at_which_a_voxel_is_entered():
     """A voxel gets the amount of the last fall before its entry, by exact shares; 0.21 and the like are no entry."""
     o, d = random_beams(seed=13)

@@ -27,6 +27,7 @@ def open_run(scenario: Scenario, run: Path) -> StageContext:
     return open_folder(scenario, run, recorded=stage_registry.recorded_digests(RunRecord.read(run)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("score", ["expected_detections", "egvs"])
 def test_score_among_other_solids_is_that_of_a_run_with_them(score: str, tmp_path: Path) -> None:
     settings = (f"score.rank_by={score}", "placement.count=2")
@@ -48,6 +49,7 @@ def test_score_among_other_solids_is_that_of_a_run_with_them(score: str, tmp_pat
     assert "rule out" in changed_plan.describe_in_other_world(context, plan, opened, {plan.sensors[1].site})
 
 
+@pytest.mark.slow
 def test_what_if_says_what_changes_for_the_plan(tmp_path: Path, run_egvs: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     toml = write_mini(tmp_path / "mini") / "scenario.toml"

@@ -133,6 +133,7 @@ def test_plan_of_one_sensor_is_best_site_by_every_score(five_candidates: Path, o
         assert placed.joint == (pytest.approx(value, rel=1e-9) if score == "expected_detections" else value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", ["effects.rain.rate_mm_h=20", "effects.divergence={}"])
 def test_weighted_beams_count_up_to_gamma(effect: str, five_candidates: Path, out: Path) -> None:
     """With effects that weight beams, one sensor has its score of the run, and two that of the definition."""
@@ -403,6 +404,7 @@ def test_rejects_altered_plan(five_candidates: Path, out: Path, run_egvs) -> Non
     assert "egvs place again" in error
 
 
+@pytest.mark.slow
 def test_threads_and_stored_scans_change_no_byte(five_candidates: Path, out: Path, run_egvs) -> None:
     plans = []
     for name, more in (("one", ["--jobs", "1"]), ("two", ["--jobs", "2"]), ("cast", ["--set", "scan.keep=false"])):

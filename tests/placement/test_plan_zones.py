@@ -75,6 +75,7 @@ def test_plan_finds_what_any_of_its_sensors_finds(
         readers.read_placement(tmp_path / "placement.parquet", tmp_path / "curve.parquet")
 
 
+@pytest.mark.slow
 def test_refined_plan_is_scanned_anew(scenario: egvs.Scenario, tmp_path: Path) -> None:
     still = plan.place(scenario, tmp_path, jobs=1)
     keys = (*KEYS, "placement.refine={radius_m=1, evaluations=20}")

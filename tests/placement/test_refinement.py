@@ -45,6 +45,7 @@ def write_sites(folder: Path, poses: dict[str, Pose]) -> None:
         writer.writerows({"site": name, **asdict(pose)} for name, pose in poses.items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [
@@ -157,6 +158,7 @@ def test_poles_do_not_move_onto_lanes(mini: Path, monkeypatch: pytest.MonkeyPatc
     assert off_lanes.sensors[0].y_m > 3.0
 
 
+@pytest.mark.slow
 def test_refined_plan_keeps_budget(mini: Path) -> None:
     """Behind a building 6 m high, a higher sensor is better and more expensive."""
     write_sites(mini, {"a": Pose(16, 8.4, 7.0)})
@@ -189,6 +191,7 @@ def test_sensors_keep_their_distance(mini: Path, setting: str, least_m: float) -
     assert placed.refinement is not None and placed.refinement.poses_infeasible > 0
 
 
+@pytest.mark.slow
 def test_forced_sensor_stays_and_costs_nothing(mini: Path) -> None:
     placed = make_plan(mini, "placement.forced=['pole_a']", "placement.refine.radius_m=2", "costs.pole=5")
     forced, other = placed.sensors
@@ -236,6 +239,7 @@ def test_rejects_plan_without_freedom(mini: Path, run_egvs) -> None:
     assert not (mini / "run" / "placement.parquet").exists()
 
 
+@pytest.mark.slow
 def test_turn_respects_number_of_evaluations(mini: Path) -> None:
     placed = make_plan(mini)
     assert placed.refinement is not None
@@ -297,6 +301,7 @@ def test_limits_of_roll_count_from_the_mount(mini: Path, roll_deg: float, at_low
     assert [pose and pose.roll_deg for pose in ends] == [at_low, at_high]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [(), ("placement.refine.roll_deg=[-10, 10]",)])
 def test_refined_sensor_stays_upside_down(mini: Path, run_egvs, settings: tuple[str, ...]) -> None:
     keys = ["sites.mount=inverted", "sites.roll_deg=2", "placement.refine.evaluations=20", *settings]
@@ -333,6 +338,7 @@ def test_pole_on_line_moves_by_half_spacing_within_ends(mini: Path) -> None:
     assert not fixed.moves_pole
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0, 1), min_size=4, max_size=4))
 def test_pole_stays_in_circle(tmp_path_factory: pytest.TempPathFactory, shares: list[float]) -> None:
     from tests.conftest import write_mini

@@ -51,6 +51,7 @@ def exported(hill: Path, out: Path) -> Scene:
     return scene
 
 
+@pytest.mark.slow
 def test_exported_scene_has_the_scores_of_the_oracle(hill: Path, tmp_path: Path) -> None:
     scores, findings = outcome(exported(hill, tmp_path).write(tmp_path / "again"))
     assert [finding for finding in findings if finding.is_error or finding.rule == "heights"] == []

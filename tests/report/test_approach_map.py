@@ -25,6 +25,7 @@ COUNTS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_labels_name_side_street_and_vehicles_per_hour(tmp_path: Path) -> None:
     extract = osm.read_osm(SMALL)

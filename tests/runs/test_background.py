@@ -193,6 +193,7 @@ def add_state(states: list[tuple[str, str]], stage: str, state: str, _record: St
     states.append((stage, state))
 
 
+@pytest.mark.slow
 def test_failed_check_ends_sumo_and_leaves_nothing(
     tmp_path: Path, store: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -293,6 +294,7 @@ def test_interrupt_ends_sumo(
     assert out.exists() == (stage == "scan")  # the stages before it are recorded
 
 
+@pytest.mark.slow
 def test_interrupt_while_the_run_waits_for_sumo(
     tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -370,6 +372,7 @@ def test_progress_is_that_of_the_stage_whose_turn_it_is(tmp_path: Path, monkeypa
     assert reported == [("late", True)]
 
 
+@pytest.mark.slow
 def test_folder_in_place_of_the_trajectories_is_not_removed(
     tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -93,6 +93,7 @@ def in_metres(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
     return scores(folder, folder / "run")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("move", "crs"),
     [

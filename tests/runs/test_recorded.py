@@ -116,6 +116,7 @@ def test_single_stages_continue_from_existing_artefacts(runs, tmp_path: Path, ru
         assert files.hash_file(tmp_path / "out" / name) == files.hash_file(made / name)
 
 
+@pytest.mark.slow
 def test_digest_of_read_artefact_is_known_after_setting_change(runs, out: Path, run_egvs) -> None:
     """Traffic of other settings is no longer what the scenario says, and its record goes; the file is still known."""
     for _ in range(2):

@@ -39,6 +39,7 @@ def machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_machine_fetches_entry_of_another_machine(
     mini: Path, tmp_path: Path, shared: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -162,6 +162,7 @@ def test_large_input_replaced_while_a_stage_works(
         egvs.run(egvs.load(mini), tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_network_replaced_while_sumo_reads_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = ['traffic.hold="at_most"', "traffic.frames=20", "traffic.warmup_s=5", "tpog.blocks=2", "roi.voxel_m=1"]
     roundabout = Path(__file__).parents[2] / "scenarios" / "roundabout"
@@ -212,6 +213,7 @@ def forge(folder: Path, name: str, source: Path) -> None:
     (folder / "run.json").write_text(files.to_json_text(checksums.add_checksum(record)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["scores.parquet", "scans.parquet"])
 def test_rehash_finds_artefacts_that_do_not_belong_to_those_beside_them(
     runs: TwoRuns, tmp_path: Path, run_egvs: Any, name: str
@@ -226,6 +228,7 @@ def test_rehash_finds_artefacts_that_do_not_belong_to_those_beside_them(
     assert "did not belong" not in run_egvs("run", runs.folder, "--out", out, "--rehash")[2]
 
 
+@pytest.mark.slow
 def test_rehash_replaces_wrong_entry_of_the_store(runs: TwoRuns, tmp_path: Path, store: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(runs.folder), tmp_path / "out")
     (entry,) = store.glob("score-*")

@@ -88,6 +88,7 @@ def test_columns_and_metadata_match_schemas(done: tuple[Path, Path]) -> None:
     assert (about["frames"], about["block_frames"]) == (40, 10)
 
 
+@pytest.mark.slow
 def test_second_run_skips_every_stage(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
     before = {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and not p.name.startswith(".")}
@@ -110,6 +111,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("change", "again"), CHANGES.items(), ids=CHANGES.keys())
 def test_changed_setting_runs_dependent_stages(
     done: tuple[Path, Path], tmp_path: Path, change: str, again: set[str]
@@ -181,6 +183,7 @@ def test_rejected_run_leaves_folder_unchanged(done: tuple[Path, Path], settings:
     assert verification.verify(out) == []
 
 
+@pytest.mark.slow
 def test_interrupted_run_records_one_scenario(done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Of what was made by then, and of no score of the scenario before; what did not change is not made again."""
     mini, out = done
@@ -247,6 +250,7 @@ def test_verify_names_altered_artefact(done: tuple[Path, Path], tmp_path: Path, 
     assert "scans.parquet" not in printed
 
 
+@pytest.mark.slow
 def test_verify_reports_changed_scenario(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,11,12,3\npole_b,30.5,-12,3\n")
@@ -277,6 +281,7 @@ def test_rejects_file_that_is_no_record(done: tuple[Path, Path]) -> None:
         egvs.run(egvs.load(mini), out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["scenario", "scenario_folder", "egvs", "seed"])
 def test_rejects_record_with_invalid_value(done: tuple[Path, Path], key: str, run_egvs) -> None:
     mini, out = done
@@ -287,6 +292,7 @@ def test_rejects_record_with_invalid_value(done: tuple[Path, Path], key: str, ru
         assert (code, f"'{key}' is" in said) == (2, True), said
 
 
+@pytest.mark.slow
 def test_rejects_damaged_record(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
     text = (out / "run.json").read_text()
@@ -387,6 +393,7 @@ def test_interrupt_prints_message(tmp_path: Path, words: tuple[str, ...]) -> Non
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_record_of_earlier_version_has_no_stages(done: tuple[Path, Path]) -> None:
     """Its stages are run again, or fetched; there is nothing to verify."""
     mini, out = done

@@ -45,6 +45,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.name: files.hash_file(path) for path in folder.glob("*.parquet")}
 
 
+@pytest.mark.slow
 def test_run_with_overrides_leaves_the_run_as_written(here: Path, run_egvs: Any) -> None:
     assert run_egvs("run", here)[0] == 0
     before = digests(Path("runs/mini"))
@@ -57,6 +58,7 @@ def test_run_with_overrides_leaves_the_run_as_written(here: Path, run_egvs: Any)
     assert sorted(path.name for path in Path("runs").iterdir()) == ["mini", "mini@gamma=5"]
 
 
+@pytest.mark.slow
 def test_stage_with_overrides_restores_the_stages_before_it(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here))
     code, printed, messages = run_egvs("score", here, "--set", "score.gamma=5")
@@ -87,6 +89,7 @@ def test_stage_without_the_stages_before_it_names_the_missing_file(
 # ---- egvs runs
 
 
+@pytest.mark.slow
 def test_lists_runs_latest_first_with_what_differs_and_the_best_site(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here))
     egvs.run(egvs.load(here, ["score.gamma=5", "traffic.frames=20"]))
@@ -139,6 +142,7 @@ def test_list_fits_the_terminal_and_cuts_no_number(width: int) -> None:
     assert ("differs in" in lines[0]) == (width >= 140)
 
 
+@pytest.mark.slow
 def test_repeated_run_is_the_latest_although_no_stage_ran(here: Path) -> None:
     egvs.run(egvs.load(here))
     egvs.run(egvs.load(here, ["score.gamma=5"]))
@@ -165,6 +169,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "content", "problem"), BROKEN.values(), ids=BROKEN)
 def test_lists_broken_runs_with_their_problem(
     here: Path, run_egvs: Any, name: str, content: str | None, problem: str
@@ -213,6 +218,7 @@ def test_run_that_waited_for_one_that_failed_has_its_folder(here: Path, monkeypa
         pass
 
 
+@pytest.mark.slow
 def test_report_of_a_run_folder(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here, ["score.gamma=5"]))
     before, record = (OTHER / "report.html").read_bytes(), RunRecord.read(OTHER)
@@ -266,6 +272,7 @@ def test_missing_run_folder_suggests_runs_with_other_settings(
     )
 
 
+@pytest.mark.slow
 def test_list_of_another_folder(here: Path, run_egvs: Any) -> None:
     assert run_egvs("runs", "elsewhere")[::2] == (
         2, "egvs: elsewhere: no such folder. Give a folder that contains run folders.\n"
@@ -291,6 +298,7 @@ def test_settings_of_a_run_are_used(here: Path) -> None:
     assert run_sources.changed_files(folder, scenario) == run_sources.edited_settings(scenario) == []
 
 
+@pytest.mark.slow
 def test_plan_of_a_run_is_written_into_it(here: Path, run_egvs: Any) -> None:
     assert run_egvs("run", here, "--set", "score.gamma=5")[0] == 0
     scores = digests(OTHER)["scores.parquet"]
@@ -302,6 +310,7 @@ def test_plan_of_a_run_is_written_into_it(here: Path, run_egvs: Any) -> None:
     assert RunRecord.read(OTHER).overrides == {"score.gamma": 5.0}
 
 
+@pytest.mark.slow
 def test_options_of_place_replace_the_request_that_a_run_recorded(here: Path, run_egvs: Any) -> None:
     (here / "scenario.toml").write_text((here / "scenario.toml").read_text() + "\n[costs]\npole = 10\n")
     assert run_egvs("place", here, "--count", 1)[0] == 0
@@ -315,12 +324,14 @@ def test_options_of_place_replace_the_request_that_a_run_recorded(here: Path, ru
     assert run_egvs("place", "runs/mini")[0] == 0  # the recorded request
 
 
+@pytest.mark.slow
 def test_check_accepts_a_run(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here, ["score.gamma=5"]))
     code, printed, _ = run_egvs("check", OTHER)
     assert (code, "checked 2 sites" in printed) == (0, True)
 
 
+@pytest.mark.slow
 def test_effects_of_a_run_name_its_scenario_and_overrides(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here, ["score.gamma=5"]))
     code, printed, _ = run_egvs("effects", OTHER)
@@ -381,6 +392,7 @@ def test_says_in_which_settings_a_scenario_differs_from_its_latest_run(here: Pat
     assert note() == ""  # an earlier run has these settings
 
 
+@pytest.mark.slow
 def test_effect_with_default_parameters_is_on(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here, ["effects.moving_occlusion={}"]))
     assert [path.name for path in Path("runs").iterdir()] == ["mini@moving_occlusion=on"]
@@ -408,6 +420,7 @@ def test_run_given_by_out_is_compared_as_well(here: Path) -> None:
     assert run_list.latest_difference(egvs.load(here), Path("runs/mini")) is None
 
 
+@pytest.mark.slow
 def test_warns_of_files_that_have_changed_since_the_run(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here, ["score.gamma=5"]))
     (here / "sites.csv").write_text((here / "sites.csv").read_text() + "pole_c,15,-8,3\n")
@@ -417,6 +430,7 @@ def test_warns_of_files_that_have_changed_since_the_run(here: Path, run_egvs: An
     assert "The plan pole_c " in printed
 
 
+@pytest.mark.slow
 def test_says_which_settings_the_scenario_file_has_changed_since_the_run(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here, ["score.gamma=5"]))
     file = here / "scenario.toml"

@@ -84,6 +84,7 @@ def test_labels_are_equal_exactly_where_settings_are(a: dict[str, Any], b: dict[
     assert settings_label(reordered) == settings_label(a)
 
 
+@pytest.mark.slow
 @given(SETTINGS)
 def test_label_is_a_file_name_on_every_system(settings: dict[str, Any]) -> None:
     label = settings_label(settings)

@@ -138,6 +138,7 @@ def test_files_read_by_sumo_and_the_report_are_checked_against_their_digests(
     assert verification.verify(out) == []
 
 
+@pytest.mark.slow
 def test_a_changed_and_a_former_setting(done: tuple[egvs.Scenario, Path]) -> None:
     """What a folder held before it was run with other settings comes back from the store."""
     scenario, out = done
@@ -170,6 +171,7 @@ def test_a_stage_with_options_runs_and_is_not_stored(done: tuple[egvs.Scenario, 
     assert {e.stage for e in assert_whole(store) if e.folder not in {b.folder for b in before}} == {"report"}
 
 
+@pytest.mark.slow
 def test_a_stage_called_by_itself_runs_and_is_stored(done: tuple[egvs.Scenario, Path], tmp_path: Path) -> None:
     scenario, out = done
     seen: list[str] = []
@@ -349,6 +351,7 @@ def test_the_bound_holds_from_the_first_entry_on(
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["file", "file/store", "l" * 300, "/".join(["long"] * 2000)])
 def test_a_store_that_cannot_be_written_is_named_once(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs, place: str
@@ -380,6 +383,7 @@ def test_invalid_store_settings_are_named(
         assert (code, printed, message in said) == (2, "", True), said
 
 
+@pytest.mark.slow
 def test_an_empty_name_is_no_store(
     done: tuple[egvs.Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs
 ) -> None:
@@ -402,6 +406,7 @@ def test_the_default_store_is_the_users_and_serves_all_working_folders(
     assert len(assert_whole(tmp_path / "cache" / "egvs" / "store")) == len(STAGE_NAMES)
 
 
+@pytest.mark.slow
 def test_the_command_line_lists_prunes_and_clears(done: tuple[egvs.Scenario, Path], store: Path, run_egvs) -> None:
     code, printed, _ = run_egvs("store")
     assert code == 0

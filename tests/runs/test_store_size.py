@@ -64,6 +64,7 @@ def lists(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
+@pytest.mark.slow
 def test_adding_entries_rarely_lists_them(tmp_path: Path, store: Path, lists: list[int]) -> None:
     for number in range(250):
         put(Store(store), number, tmp_path / "out")

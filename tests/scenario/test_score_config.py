@@ -61,6 +61,7 @@ def test_rejects_gamma_whose_squares_are_no_numbers(auto: Path, gamma: str) -> N
         egvs.load(auto, [f"score.gamma={gamma}"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gamma", [1e-9, 1e12, 1e300])
 def test_errors_of_smallest_and_largest_gamma_are_in_proportion(auto: Path, tmp_path: Path, gamma: float) -> None:
     """The smallest caps every voxel; the largest caps none."""

@@ -200,6 +200,7 @@ def test_errors_of_a_run_match_a_slow_twin(mini: Path, tmp_path: Path) -> None:
         assert row["behind_best_detectors_se"] == pytest.approx(math.sqrt(detectors), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_detector_alone_has_its_own_score_and_the_error_of_the_traffic(mini: Path, tmp_path: Path) -> None:
     both = run(mini, tmp_path / "all")
     alone = {name: run(mini, tmp_path / name, f"score.detector='{name}'") for name in DETECTORS}
@@ -249,6 +250,7 @@ def test_rejects_unknown_detectors_and_those_without_effect(mini: Path, override
         egvs.load(mini, overrides)
 
 
+@pytest.mark.slow
 def test_option_sets_the_key(mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     sets = ("--set", RANKED)
     code, printed, told = run_egvs(

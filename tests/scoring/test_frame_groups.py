@@ -103,6 +103,7 @@ def test_the_standard_error_is_as_large_as_the_error_is():
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(scores), rel=0.2)
 
 
+@pytest.mark.slow
 def test_of_a_run(tmp_path):
     scenario = egvs.load(write_mini(tmp_path / "mini"), ["tpog.blocks=4"])
     egvs.run(scenario, tmp_path / "run", jobs=1)

@@ -89,6 +89,7 @@ def test_expected_points_are_the_sum_of_probabilities() -> None:
     assert (result.points_on_sides <= result.points + 1e-9).all() and (result.points_on_sides > 0.0).any()
 
 
+@pytest.mark.slow
 def test_expected_extents_are_the_mean_over_draws() -> None:
     """A beam counts by its probability: not fully, as it would if any probability were enough."""
     result, plain = visible(losses()), visible(None)

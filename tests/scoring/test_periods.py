@@ -54,6 +54,7 @@ def of(table: object) -> list[dict[str, object]]:
     return table.to_pylist()  # type: ignore[attr-defined, no-any-return]
 
 
+@pytest.mark.slow
 def test_mix_is_exact(split: Path, tmp_path: Path) -> None:
     record = egvs.run(egvs.load(split), tmp_path)
     path = tmp_path / "tpog.parquet"
@@ -189,6 +190,7 @@ def test_variances_and_biases_of_a_mix_add_up_by_hand() -> None:
     assert estimate.freedom == pytest.approx((1 + 121 / 18) ** 2 / (1 + (121 / 18) ** 2))  # one degree each
 
 
+@pytest.mark.slow
 def test_standard_errors_of_mix_and_periods_are_reported(split: Path, tmp_path: Path) -> None:
     record = egvs.run(egvs.load(split), tmp_path)
     rows = of(egvs.read_scores(tmp_path / "scores.parquet"))
@@ -386,6 +388,7 @@ def test_a_key_that_acts_in_one_period_may_stand_for_all(split: Path) -> None:
     assert (day.fcd, night.sumocfg, night.step_s) == ("fcd.csv", "night.sumocfg", 0.5)
 
 
+@pytest.mark.slow
 def test_rejects_unknown_period(split: Path, tmp_path: Path) -> None:
     egvs.run(egvs.load(split), tmp_path)
     with pytest.raises(InputError, match=r"there is no period 'noon'\. The periods are day, night"):

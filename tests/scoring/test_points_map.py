@@ -142,6 +142,7 @@ def test_region_without_lanes_has_no_surface(streets: Network) -> None:
     assert np.isnan(positions.points_map(sweep(Pose(505.0, 505.0, 3.0))).values).all()
 
 
+@pytest.mark.slow
 def test_maps_of_a_run_are_drawn_and_exported(mini: Path, tmp_path: Path) -> None:
     """The GeoTIFF has the numbers of the map at their places; the page has both maps and the overlap."""
     pytest.importorskip("rasterio", reason="the extra egvs[gis] is not installed")

@@ -122,6 +122,7 @@ def test_standard_error_of_voxel_share_matches_groups(mini: Path, tmp_path: Path
         assert row[f"{name}_se"] < 3 * scatter
 
 
+@pytest.mark.slow
 def test_no_standard_errors_when_disabled(mini: Path, tmp_path: Path) -> None:
     for number, override in enumerate(("score.standard_error=false", "tpog.blocks=1")):
         rows = run(mini, tmp_path / str(number), ALL, override, "score.rank_by=seen_well")
@@ -337,6 +338,7 @@ def test_list_of_scores_ends_with_those_that_rank(plugin: None, run_egvs) -> Non
     assert code == 0 and "my_score" in last and "broken" not in last and "of_sites" not in last
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("periods", [(), (PERIODS,)], ids=["no periods", "periods"])
 def test_ranks_and_plans_by_the_score_of_a_plugin(
     mini: Path, tmp_path: Path, plugin: None, periods: tuple[str, ...], run_egvs

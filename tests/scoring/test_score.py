@@ -47,6 +47,7 @@ def write_sites(folder, *rows):
     (folder / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\n" + "\n".join(rows) + "\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gamma", [0.0, 0.3, 1.0, 4.0, 1e9, inf])
 def test_score_is_its_definition(mini, tmp_path, gamma):
     rows = run(mini, tmp_path, f"score.gamma={gamma}")
@@ -59,6 +60,7 @@ def test_score_is_its_definition(mini, tmp_path, gamma):
     assert float(about["gamma"]) == gamma
 
 
+@pytest.mark.slow
 def test_number_of_threads_changes_no_byte(mini, tmp_path):
     write_sites(mini, *(f"s{n},{9 + 3 * n},11,{3 + n / 2},small" for n in range(8)))
     run(mini, tmp_path)
@@ -152,6 +154,7 @@ def test_static_voxels_have_no_entropy(mini, tmp_path):
         assert (row["egvs"], row["egvs_limit"], row["entropy_seen"]) == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_gamma_and_voxels_need_no_new_scan(mini, tmp_path):
     run(mini, tmp_path)
     before = (tmp_path / "scans.parquet").read_bytes()

@@ -64,6 +64,7 @@ def test_hits_belong_to_the_caller_and_scores_to_no_order(run):
     assert np.array_equal(hits, kept) and scorer.score(first) == score
 
 
+@pytest.mark.slow
 def test_threads_and_other_processes_get_the_same(run):
     scene, folder = run
     scanner, scorer = Scanner(scene), scorer_of(scene, folder)

@@ -191,6 +191,7 @@ def test_table_equals_a_loop_over_frames(scored: tuple[egvs.Scenario, Path]) -> 
         assert table[key]["share_found_se"] == pytest.approx(error, abs=1e-12, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_without_zones_all_other_artefacts_are_the_same(scored: tuple[egvs.Scenario, Path], tmp_path: Path) -> None:
     scenario, out = scored
     plain = loading.load(scenario.folder, ["score.rank_by='expected_detections'"])
@@ -221,6 +222,7 @@ def test_report_shows_the_zones_of_the_best_site(scored: tuple[egvs.Scenario, Pa
     assert ">far</th>" not in section
 
 
+@pytest.mark.slow
 def test_editing_the_file_scores_again(scored: tuple[egvs.Scenario, Path]) -> None:
     scenario, out = scored
     before = pq.read_table(out / "zones.parquet").to_pylist()

@@ -82,6 +82,7 @@ def test_geojson_in_degrees_gives_the_area_in_metres(mini: Path) -> None:
     assert area.symmetric_difference(shapely.Polygon(WEST_M)).area < 0.01
 
 
+@pytest.mark.slow
 def test_zone_of_a_file_scores_and_plans_as_the_same_corners(mini: Path, tmp_path: Path) -> None:
     write_zones(mini / "zones.geojson", None, west=WEST_M, east=EAST_M)
     corners = f"score.weights.zones.west={{weight=4, polygon_m={WEST_M}}}"
@@ -100,6 +101,7 @@ def test_zone_of_a_file_scores_and_plans_as_the_same_corners(mini: Path, tmp_pat
     assert 0.0 < plans[0].zones[0].seen <= 1.0
 
 
+@pytest.mark.slow
 def test_moving_a_zone_in_its_file_scores_again(mini: Path, tmp_path: Path) -> None:
     write_zones(mini / "zones.geojson", None, west=WEST_M)
     scenario = loading.load(mini, [weight("west", "zones.geojson"), 'score.others=["seen_well"]'])

@@ -471,6 +471,7 @@ def test_rejects_contradictory_patterns(pattern: dict[str, Any]) -> None:
         SensorConfig.from_dict({"range_m": 9, "pattern": pattern})
 
 
+@pytest.mark.slow
 def test_expected_hits_are_proportional_to_the_dwell_time(mini: Path, tmp_path: Path) -> None:
     """Equal dwell times and a pulse for each direction are the table itself; with half the pulses, half the hits."""
     small = scenario_sensor("small", egvs.load(mini), "here")

@@ -367,6 +367,7 @@ def test_middle_of_a_table_is_that_of_its_smallest_arc() -> None:
     assert BeamTable(np.zeros(1), np.array([270.0])).azimuth_span_deg == (-90.0, -90.0)
 
 
+@pytest.mark.slow
 def test_ring_sensor_as_table_has_the_same_scores(mini: Path, tmp_path: Path) -> None:
     """The table of the small sensor, beam by beam: the same scans to the last bit, so the same scores."""
     by_rings = egvs.run(egvs.load(mini), tmp_path / "rings")

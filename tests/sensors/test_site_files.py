@@ -148,6 +148,7 @@ def test_accepts_custom_columns_of_similar_names_and_empty_ones(mini: Path, name
     assert site.user_columns == {name: int(value) if value else None}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "meant"), [("heigth_m", "height_m"), ("height", "height_m"), ("bse_m", "base_m")])
 def test_rejects_misspelt_height_of_a_footprint(mini: Path, tmp_path: Path, run_egvs, name: str, meant: str) -> None:
     heights = {"height_m": 6, "base_m": 3, "building:levels": 2, "owner": "x"}

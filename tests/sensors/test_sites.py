@@ -153,6 +153,7 @@ def test_rows_at_one_position_share_a_pole(mini: Path) -> None:
     assert [site.pole for site in result] == ["low", "low", "else"]
 
 
+@pytest.mark.slow
 def test_run_ranks_candidates_and_groups_them_by_pole(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     (mini / "sites.csv").write_text("site,x_m,y_m\nc01,10,12\nc02,30.5,-12\n")
     expected = ["sites.heights_m=[3, 4.5]", 'sites.pitch_deg=[0, "aim"]', "sites.aim=roi", "score.standard_error=false"]
@@ -174,6 +175,7 @@ def test_run_ranks_candidates_and_groups_them_by_pole(mini: Path, tmp_path: Path
         assert f'<th scope="row">{pole}</th><td>{row["site"]}</td>' in section
 
 
+@pytest.mark.slow
 def test_no_table_of_poles_with_one_candidate_each(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     _, out, _ = run_egvs("run", mini, "--out", tmp_path / "run", "--all")
     assert "best candidate on each pole" not in out

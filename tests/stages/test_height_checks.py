@@ -140,6 +140,7 @@ def test_thin_solids_beside_the_road_float_above_decks(street: Path) -> None:
     assert "1 of 1 solid near the region has its foot 30.0 m above the road beside it: garage" in told
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(
     "folder", sorted(path.parent for path in SCENARIOS.glob("*/scenario.toml")), ids=lambda p: p.name

@@ -11,6 +11,7 @@ from egvs.formats.meshes import mesh_digests, referenced_files
 from egvs.runs import run
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_changed_mesh_buffer_repeats_statics(mini: Path, tmp_path: Path) -> None:
     out, scenario = tmp_path / "out", mini / "scenario.toml"

@@ -23,6 +23,7 @@ def warnings(folder: Path, out: Path, *settings: str) -> dict[str, list[str]]:
     return {name: lines for name, lines in told.items() if lines}
 
 
+@pytest.mark.slow
 def test_two_vehicles_per_frame_are_enough(mini: Path, tmp_path: Path) -> None:
     """Two cars pass each other along the whole region, but in the first and last frames one of them is outside."""
     assert list(occupancy.warn_empty_region(2.0, tmp_path / "is not read")) == []

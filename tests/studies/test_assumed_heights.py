@@ -59,6 +59,7 @@ def test_only_assumed_heights_of_buildings_change() -> None:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_ranks_change_with_the_wall(here: Path, run_egvs) -> None:
     code, printed, error = run_egvs("compare", "mini", "--assumed-heights")
     assert code == 0, error

@@ -39,6 +39,7 @@ def reference_of(found: np.ndarray) -> Reference:
     return Reference(found, np.arange(found.shape[1]))
 
 
+@pytest.mark.slow
 def test_two_equal_poles_are_a_coin_toss_and_cost_nothing() -> None:
     """Over many studies: the choice of the maximum of noisy values is not taken for a gain, nor for a loss."""
     chances, losses, unclipped = [], [], []
@@ -123,6 +124,7 @@ def test_model_agrees_with_draws_of_the_same_length() -> None:
     assert np.mean(modelled) == pytest.approx(np.mean(counted), abs=0.15)
 
 
+@pytest.mark.slow
 def test_traffic_that_is_needed_follows_from_the_normal_distribution() -> None:
     """With L units, the better of two poles is missed with probability Phi(-d sqrt(L) / s), where d is the mean
     difference in the units that do not judge, and s its scatter; what that loses is the difference in the judging one.

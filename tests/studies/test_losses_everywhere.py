@@ -39,6 +39,7 @@ def by_itself(mini: Path, tmp_path: Path) -> list[float]:
     return shares(mini, tmp_path / "by_itself", *RATED)
 
 
+@pytest.mark.slow
 def test_run(mini: Path, tmp_path: Path, by_itself: list[float]) -> None:
     assert shares(mini, tmp_path / "named", *RATED, NAMED) == by_itself
     off = shares(mini, tmp_path / "off", *RATED, OFF)
@@ -65,6 +66,7 @@ def test_sensor_whose_losses_cannot_matter_has_the_bytes_of_before(mini: Path, t
     assert "losses" not in RunRecord.read(tmp_path / "far").stages["check"].summary
 
 
+@pytest.mark.slow
 def test_all_sensors_have_losses_if_one_needs_them(mini: Path, tmp_path: Path) -> None:
     """Without them, it would gain on the other by its dropout."""
     text = (mini / "scenario.toml").read_text()
@@ -81,6 +83,7 @@ def test_all_sensors_have_losses_if_one_needs_them(mini: Path, tmp_path: Path) -
     assert losses == {"on": ["small", "far"], "negligible": [], "unrated": []}
 
 
+@pytest.mark.slow
 def test_plan(mini: Path, tmp_path: Path, by_itself: list[float]) -> None:
     placed = egvs.place(
         egvs.load(mini, [*RATED, "placement.count=1", "score.rank_by=expected_detections"]),
@@ -96,6 +99,7 @@ def test_plan(mini: Path, tmp_path: Path, by_itself: list[float]) -> None:
     assert off.joint > placed.joint
 
 
+@pytest.mark.slow
 def test_what_if(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(mini.parent)
     lines = "\n".join(["", "[what_if.far]", "share = 0.5", 'vehicles = "parked.csv"', ""])

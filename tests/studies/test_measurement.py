@@ -67,6 +67,7 @@ def test_cached_stages_count_with_their_original_time_until_they_are_measured(mi
     assert timed.seconds != cached.seconds
 
 
+@pytest.mark.slow
 def test_stages_of_another_run_are_measured_again(mini: Path, tmp_path: Path) -> None:
     """The first run in a clone compiles: its times are not those of the scenario."""
     egvs.run(egvs.load(mini), tmp_path / "run")

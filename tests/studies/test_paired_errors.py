@@ -80,6 +80,7 @@ def test_sensors_of_one_run_are_compared_as_neighbours_in_its_ranking(
     assert comparison.sensors.sensors == (worst["sensor"], best["sensor"])
 
 
+@pytest.mark.slow
 def test_runs_with_the_same_traffic_are_paired(junction_with_two_sensors: Path, tmp_path: Path) -> None:
     scenario = junction_with_two_sensors
     egvs.run(egvs.load(scenario), tmp_path / "a")

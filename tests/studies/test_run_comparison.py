@@ -40,6 +40,7 @@ def two(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
     return first, second
 
 
+@pytest.mark.slow
 def test_compares_scores_shares_ranks_and_settings(two: tuple[Path, Path]) -> None:
     comparison = compare_runs(two, by="site")
     assert [run.label for run in comparison.runs] == ["A", "B"]
@@ -63,6 +64,7 @@ def test_compares_scores_shares_ranks_and_settings(two: tuple[Path, Path]) -> No
     )
 
 
+@pytest.mark.slow
 def test_run_compared_with_itself_has_no_differences(two: tuple[Path, Path]) -> None:
     comparison = compare_runs([two[0], two[0]])
     (pair,) = comparison.agreements
@@ -138,6 +140,7 @@ def test_agreement_by_pole_uses_the_best_mount_of_each() -> None:
     assert pair.regret_a == pytest.approx(1 / 7)
 
 
+@pytest.mark.slow
 def test_same_pole_with_another_name_or_height_is_matched(two: tuple[Path, Path], mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\nlamp,10,12,4.5\nlamp low,10,12,2.5\n")
     egvs.run(egvs.load(mini), tmp_path / "third")
@@ -159,6 +162,7 @@ def test_same_pole_with_another_name_or_height_is_matched(two: tuple[Path, Path]
     assert comparison.agreements[0].shared == 1
 
 
+@pytest.mark.slow
 def test_pole_that_was_moved_is_another_pole(two: tuple[Path, Path], mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12.5,3\npole_b,30.5,-12,3\n")
     egvs.run(egvs.load(mini), tmp_path / "third")
@@ -176,6 +180,7 @@ def test_pole_that_was_moved_is_another_pole(two: tuple[Path, Path], mini: Path,
     assert "pole_a is 0.50 m away" in message
 
 
+@pytest.mark.slow
 def test_runs_without_common_pole_are_refused(two: tuple[Path, Path], mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\nlamp,11,12,3\n")
     egvs.run(egvs.load(mini), tmp_path / "third")
@@ -188,6 +193,7 @@ def test_runs_without_common_pole_are_refused(two: tuple[Path, Path], mini: Path
     assert "note: A and B have no site name in common, so their rankings cannot be compared" in printed
 
 
+@pytest.mark.slow
 def test_sensors_of_one_run_on_different_poles_are_compared(mini: Path, run_egvs) -> None:
     file = mini / "scenario.toml"
     other = (
@@ -211,6 +217,7 @@ def test_sensors_of_one_run_on_different_poles_are_compared(mini: Path, run_egvs
     assert "--by site: expected a second run" in message
 
 
+@pytest.mark.slow
 def test_default_view_is_by_site_where_mounts_are_the_same(two: tuple[Path, Path], mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n")
     egvs.run(egvs.load(mini, ["score.gamma=2"]), tmp_path / "gamma")
@@ -218,12 +225,14 @@ def test_default_view_is_by_site_where_mounts_are_the_same(two: tuple[Path, Path
     assert compare_runs(two).by == "pole"  # pole_a is higher in the second run
 
 
+@pytest.mark.slow
 def test_scores_that_cannot_be_subtracted_have_no_difference(two: tuple[Path, Path]) -> None:
     comparison = compare_runs(two)
     assert [pole.differences for pole in comparison.poles] == [(None, None)] * 3
     assert "A and B differ in score.gamma: compare ranks and shares, not bits" in comparison.notes
 
 
+@pytest.mark.slow
 def test_compare_command_prints_tables_and_notes(two: tuple[Path, Path], run_egvs) -> None:
     code, printed, _ = run_egvs("compare", *two, "--by", "site")
     assert code == 0
@@ -431,6 +440,7 @@ def test_tables_name_the_reference_of_their_differences(monkeypatch: pytest.Monk
     assert "from t" in next(line for line in text.splitlines() if line.startswith("sensor"))
 
 
+@pytest.mark.slow
 def test_costs_of_the_command_line_replace_those_of_the_run(mini: Path, tmp_path: Path, run_egvs) -> None:
     egvs.run(egvs.load(mini, ["costs.pole=5", "costs.sensor={small=7}"]), tmp_path / "run")
     both = [tmp_path / "run", tmp_path / "run"]
@@ -493,6 +503,7 @@ def test_labels_continue_after_z() -> None:
     assert [run_comparison.run_label(n) for n in (0, 25, 26, 27, 52)] == ["A", "Z", "AA", "AB", "BA"]
 
 
+@pytest.mark.slow
 def test_rejects_the_same_run_twice(two: tuple[Path, Path], tmp_path: Path, run_egvs) -> None:
     (tmp_path / "link").symlink_to(two[0])
     for again in (two[0], f"{two[0]}/", tmp_path / "link"):
@@ -501,6 +512,7 @@ def test_rejects_the_same_run_twice(two: tuple[Path, Path], tmp_path: Path, run_
         assert message.startswith(f"egvs: compare: the same run twice, {two[0]}")
 
 
+@pytest.mark.slow
 def test_plan_request_is_no_difference(two: tuple[Path, Path]) -> None:
     record = RunRecord.read(two[1])
     record.scenario["placement"] |= {"count": 2, "least_distance_m": 4.0}
@@ -510,6 +522,7 @@ def test_plan_request_is_no_difference(two: tuple[Path, Path]) -> None:
     assert "placement.count" not in differences
 
 
+@pytest.mark.slow
 def test_rejects_folders_without_finished_run(two: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a second run, because all sites of this one have the sensor small"):
         compare_runs(two[:1])

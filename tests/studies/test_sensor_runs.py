@@ -28,6 +28,7 @@ def run_folders(here: Path) -> list[str]:
     return sorted(path.name for path in (here / "runs").iterdir())
 
 
+@pytest.mark.slow
 def test_runs_each_sensor_and_prints_what_compare_prints_for_these_runs(here: Path, run_egvs) -> None:
     code, printed, error = run_egvs("compare", "mini", "--sensors", "small,VLP-16")
     assert code == 0, error
@@ -51,6 +52,7 @@ def test_runs_each_sensor_and_prints_what_compare_prints_for_these_runs(here: Pa
     assert [line.split()[1] for line in again[2].splitlines()[-2:]] == ["unchanged", "unchanged"]
 
 
+@pytest.mark.slow
 def test_settings_go_to_the_runs_and_costs_to_the_comparison(here: Path, run_egvs) -> None:
     settings = ("--set", "effects.range_limit={}", "--set", 'costs.sensor={"VLP-16"=4000, "VLP-32C"=8000}')
     code, printed, error = run_egvs("compare", "mini", "--sensors", "VLP-16,VLP-32C", *settings)
@@ -66,6 +68,7 @@ def test_settings_go_to_the_runs_and_costs_to_the_comparison(here: Path, run_egv
     assert "Losses of returns are not simulated" not in printed
 
 
+@pytest.mark.slow
 def test_range_is_named_as_not_modelled(here: Path, run_egvs) -> None:
     off = ("--set", "effects.range_limit=false")
     for options, count in (((), 0), (off, 1)):

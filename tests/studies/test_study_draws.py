@@ -91,6 +91,7 @@ def test_rows_have_the_traffic_of_their_options(name: str, request: pytest.Fixtu
         assert changed.score.sampled_frames == row.sampled_frames
 
 
+@pytest.mark.slow
 def test_parts_of_a_variant_keep_its_other_options(junction: Path) -> None:
     step = next(s for s in study_settings.list_variants(egvs.load(junction)) if s.knob == "step" and "1 s" in s.name)
     scenario = egvs.load(junction, step.overrides)

@@ -93,6 +93,7 @@ def test_thinned_catalogue_sensor_has_a_subset_of_its_beams(mini: Path, sensor: 
         assert {tuple(ray) for ray in thin.directions(30.0).tolist()} <= every
 
 
+@pytest.mark.slow
 def test_effects_are_left_out_and_their_quality_is_varied(mini: Path, tmp_path: Path) -> None:
     sets = ["effects.moving_occlusion.frames=500"]
     settings = settings_by_name(mini, *sets)
@@ -137,6 +138,7 @@ def test_measured_scans_are_not_thinned(mini: Path) -> None:
     assert not {"azimuth", "channels"} & {s.knob for s in study_settings.list_variants(egvs.load(mini))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["nishishinjuku", "ingolstadt", "roundabout"])
 def test_settings_are_valid_scenarios(name: str) -> None:
     folder = ROOT / "scenarios" / name

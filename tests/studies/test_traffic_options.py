@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 import egvs
 from egvs.studies import study_settings, traffic_options
 from egvs.studies.study_settings import SettingValues
@@ -85,6 +87,7 @@ def test_given_routes_leave_out_routing_only(junction: Path) -> None:
     assert not any("routes" in name for name in overrides_by_name(junction))
 
 
+@pytest.mark.slow
 def test_study_of_a_finished_file_names_what_is_left_out(mini: Path, tmp_path: Path) -> None:
     study = run_study(mini, [], tmp_path / "out", values=ONLY_TRAFFIC)
     assert study.skipped == dict.fromkeys(("SUMO's step", "sublanes", "routing"), "the traffic was recorded")

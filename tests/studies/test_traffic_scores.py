@@ -49,6 +49,7 @@ def test_threefold_sampling_contains_the_frames_of_the_scenario(mini: Path, tmp_
     assert scores.ranking_score(Window(0, 4), frames=4) == pytest.approx(table["expected_detections"].to_numpy())
 
 
+@pytest.mark.slow
 def test_voxel_score_of_a_window_is_that_of_a_run_with_this_traffic(mini: Path, tmp_path: Path) -> None:
     scores = scores_of(mini, tmp_path / "run")
     for window, frames in ((Window(0, 4), 40), (Window(0, 2), 20)):

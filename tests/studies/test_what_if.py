@@ -71,6 +71,7 @@ def answered(tmp_path_factory: pytest.TempPathFactory) -> WhatIfResult:
         return compare_runs(runs, run_one)
 
 
+@pytest.mark.slow
 def test_lorry_hides_both_lanes_from_the_pole_behind_it(answered: WhatIfResult) -> None:
     """All beams of pole_a that point south end on the lorry: nothing of the lanes is left."""
     before, present = (by_name(one.folder)["pole_a"] for one in answered.runs[:2])
@@ -99,6 +100,7 @@ def test_solids_that_hide_the_same_vehicles_leave_no_negative_score() -> None:
     assert together.tolist() == pytest.approx([(993 - 0.3 * 837) / 993 * 224, 5.0, 13.0])
 
 
+@pytest.mark.slow
 def test_all_together_is_between_0_and_the_worst_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     same = LORRY.replace("what_if.lorry", "what_if.same").replace("0.25", "1")
@@ -157,6 +159,7 @@ def test_traffic_is_simulated_once(answered: WhatIfResult) -> None:
     assert records[0]["statics"].artefacts != records[1]["statics"].artefacts
 
 
+@pytest.mark.slow
 def test_command_prints_the_answer_and_repeats_it_from_the_folders(
     tmp_path: Path, monkeypatch: Any, run_egvs: Any
 ) -> None:
@@ -172,6 +175,7 @@ def test_command_prints_the_answer_and_repeats_it_from_the_folders(
     assert [line.split()[-2] for line in stages[-2:]] == ["unchanged"] * 2
 
 
+@pytest.mark.slow
 def test_solid_over_a_site_gets_the_message_of_the_check(tmp_path: Path, monkeypatch: Any, run_egvs: Any) -> None:
     scenario(tmp_path, LORRY.replace("y_m = 10", "y_m = 12"))
     monkeypatch.chdir(tmp_path)
@@ -180,6 +184,7 @@ def test_solid_over_a_site_gets_the_message_of_the_check(tmp_path: Path, monkeyp
     assert "(10, 12, 3) is inside lorry_1 (lorry)" in error
 
 
+@pytest.mark.slow
 def test_scenario_without_tables_has_the_same_record_and_keys(tmp_path: Path) -> None:
     plain = load(write_mini(tmp_path / "mini"))
     assert "what_if" not in plain.model_dump(mode="json")

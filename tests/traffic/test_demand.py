@@ -304,6 +304,7 @@ def lane_km(town):
     return sum(lane.length_m for lane in lanes) / 1000
 
 
+@pytest.mark.slow
 def test_number_of_vehicles_is_proportional_to_lane_length(town, tmp_path):
     assert lane_km(town) == pytest.approx(5, abs=0.5)
     keys = {"network": "net.xml", "frames": 40, "warmup_s": 60.0}
@@ -369,6 +370,7 @@ def test_vehicle_density_ignores_lanes_closed_to_the_fleet(tmp_path):
     assert demand.target_vehicle_count(drawn(vehicles=3), net) == 3
 
 
+@pytest.mark.slow
 def test_ring_road_gets_trips_between_any_edges_and_a_note(tmp_path):
     netgenerate(
         tmp_path,

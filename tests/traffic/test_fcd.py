@@ -103,6 +103,7 @@ class GrowingFile:
         return False
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(0, len(CSV)), max_size=6), st.sampled_from([1, 40, 1 << 20]))
 def test_file_that_grows_has_the_rows_of_the_complete_file(tmp_path_factory, cuts, block_bytes):
     path = tmp_path_factory.mktemp("growing") / "fcd.csv"
@@ -288,6 +289,7 @@ def test_rejects_file_without_vehicles():
         list(group_frames([], FrameWindow(2, 250), 10, "place"))
 
 
+@pytest.mark.slow
 @given(
     present=st.lists(st.integers(0, 3), min_size=1, max_size=40),
     cuts=st.lists(st.integers(0, 120), max_size=6),
@@ -319,6 +321,7 @@ def test_rejects_frames_with_too_many_vehicles(monkeypatch):
         list(group_frames(tables, FrameWindow(1, 1000), 1, "here"))
 
 
+@pytest.mark.slow
 def test_rejects_parquet_file_with_implausible_number_of_rows(tmp_path):
     """Three million rows that are all the same, in a few kilobytes."""
     n = 3_000_000

@@ -81,6 +81,7 @@ def test_frames_after_the_last_full_block_are_skipped_with_a_note(mini: Path, tm
     assert (ours.counts == theirs.counts).all()
 
 
+@pytest.mark.slow
 def test_frames_after_the_last_full_block_of_a_period_are_skipped(mini: Path, tmp_path: Path) -> None:
     """``[traffic]`` simulates, and one of its periods is a finished file."""
     (mini / "net.net.xml").write_text(net_xml())
@@ -167,6 +168,7 @@ def test_vtypes_override_the_default_fleet(mini: Path, tmp_path: Path) -> None:
     assert {row["length_m"] for row in rows} == {4.0}
 
 
+@pytest.mark.slow
 def test_names_all_types_without_size(mini: Path, tmp_path: Path, run_egvs) -> None:
     set_types(mini, "tram", "car", "lorry", "car")
     code, _, output = run_egvs("run", mini, "--out", tmp_path)

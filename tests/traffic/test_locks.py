@@ -179,6 +179,7 @@ def test_locked_region_is_listed_and_others_go_on(tmp_path, roads):
         watch(tmp_path, roads, REGIONS).finish()
 
 
+@pytest.mark.slow
 def test_share_that_is_moved_on_is_of_vehicles_near_the_region(tmp_path, roads):
     lines = [
         f"Warning: Teleporting vehicle 'v{i}'; waited too long (jam), lane='in_0', time={10 * i}.00."
@@ -207,6 +208,7 @@ def test_decision_does_not_depend_on_when_files_are_read(tmp_path, roads):
     assert len(set(messages)) == 1
 
 
+@pytest.mark.slow
 def test_region_is_locked_when_too_many_vehicles_are_moved_on(tmp_path, roads):
     """One in ten seconds: the tenth, at 100 s, is the first that is refused."""
     lines = [

@@ -42,6 +42,7 @@ def read(tmp_path: Path, index: ApproachIndex, *lines: str, periods: tuple[str, 
     return observed.read_observations(tmp_path / "o.csv", index, periods)
 
 
+@pytest.mark.slow
 def test_approaches_are_named_as_in_counts(tmp_path: Path, index: ApproachIndex) -> None:
     assert index.titles == APPROACHES
     lines = "street,approach,queue_m,speed_kmh", "North St,N,40,", ",westbound,,22", ",S,0,12.5"
@@ -89,6 +90,7 @@ def test_scenario_with_periods_needs_them_in_the_file(tmp_path: Path, index: App
         read(tmp_path, index, HEAD, "N,3,", periods=periods)
 
 
+@pytest.mark.slow
 def test_check_reports_a_bad_file_and_missing_counts(crossing: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.csv").write_text(f"{HEAD}\nX,1,2\n")
     overrides = [f"traffic.observed='{tmp_path / 'bad.csv'}'"]

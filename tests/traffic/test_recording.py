@@ -29,6 +29,7 @@ from tests.traffic.helpers import (
 )
 
 
+@pytest.mark.slow
 def test_seed_determines_the_traffic(town, recorded, tmp_path):
     run_stage(traffic, scenario(town, network="net.xml", **SMALL), tmp_path / "again", jobs=1)
     run_stage(traffic, scenario(town, seed=2, network="net.xml", **SMALL), tmp_path / "other")
@@ -37,6 +38,7 @@ def test_seed_determines_the_traffic(town, recorded, tmp_path):
     assert (tmp_path / "other" / "trajectories.parquet").read_bytes() != first
 
 
+@pytest.mark.slow
 def test_moved_folder_reproduces_the_traffic_as_finished_file(recorded, tmp_path):
     """A user opens run.sumocfg elsewhere, records FCD there, and names that file in a scenario."""
     _, table, _, out = recorded
@@ -72,6 +74,7 @@ def test_recording_over_traci_is_identical(town, recorded, tmp_path):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("retry_connecting")
 def test_rejects_running_sumo_with_wrong_step_or_late_clock(town, recorded, tmp_path):
     folder = recorded[3] / "sumo"
@@ -82,6 +85,7 @@ def test_rejects_running_sumo_with_wrong_step_or_late_clock(town, recorded, tmp_
     assert not (tmp_path / "trajectories.parquet").exists()
 
 
+@pytest.mark.slow
 def test_sizes_of_user_routes_come_from_sumo(town, tmp_path):
     (tmp_path / "own.rou.xml").write_text(routes_for(town))
     shutil.copy(town / "net.xml", tmp_path)
@@ -145,6 +149,7 @@ def test_collision_warning_names_junctions_and_edges(tmp_path):
     assert recording._collision_warning({}, scenario(tmp_path, network="net.xml")) == []
 
 
+@pytest.mark.slow
 def test_warns_about_vehicles_that_could_not_start(town, tmp_path):
     """Six hundred cars an hour too many for one street."""
     roads = network.read_net_xml(town / "net.xml")
@@ -182,6 +187,7 @@ def empty(path):
     path.write_bytes(b"")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "damage"),
     [
@@ -328,6 +334,7 @@ def test_roundabout_sources_give_the_committed_network(tmp_path):
     assert made[0] == made[1]
 
 
+@pytest.mark.slow
 def test_roundabout_traffic_is_constant_and_counter_clockwise(tmp_path):
     scene = load(ROUNDABOUT, ["traffic.frames=120", "traffic.warmup_s=100", "tpog.blocks=1"])
     result = run_stage(traffic, scene, tmp_path)

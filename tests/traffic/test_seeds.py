@@ -91,6 +91,7 @@ def test_intervals_cover_levels_that_blocks_of_one_simulation_miss():
     assert covered["blocks"] / 500 < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_seeds_by_hand_give_the_same_grid(town, tmp_path):
     together = trial(town, blocks=4, frames=2 * FRAMES, seeds=2)
@@ -120,6 +121,7 @@ def test_seeds_by_hand_give_the_same_grid(town, tmp_path):
     assert summary["rows"] == len(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_threads_do_not_change_bytes(town, tmp_path):
     setup = trial(town, blocks=3, frames=60, seeds=3)
@@ -131,6 +133,7 @@ def test_threads_do_not_change_bytes(town, tmp_path):
     assert not list((tmp_path / "3" / "sumo").glob("*/fcd.csv"))
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_each_period_has_its_simulations(town, tmp_path):
     periods = [{"name": "day", "weight": 2}, {"name": "night", "length_s": 10.0}]
@@ -148,6 +151,7 @@ def test_each_period_has_its_simulations(town, tmp_path):
     assert [np.unique(prefixes[frames // 10 == part]).tolist() for part in (4, 5)] == [["1"], ["2"]]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_one_seed_is_the_run_without_the_key(town, tmp_path):
     for name, keys in (("without", {}), ("one", {"seeds": 1})):

@@ -477,6 +477,7 @@ def test_long_ids_are_shortened_and_still_accepted(tmp_path):
         signal_plans.find_signal("cluster_1423165998_…", [long, twin], "x")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signalised", [True, False])
 def test_network_without_internal_links_is_rejected(crossing, tmp_path, signalised):
     """Vehicles would jump across the junction, and signals cannot be read; the message says how to make it again."""

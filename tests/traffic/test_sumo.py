@@ -126,6 +126,7 @@ def test_rejects_server_that_is_not_sumo(town, tmp_path, monkeypatch, answer):
     assert not (tmp_path / "trajectories.parquet").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("retry_connecting")
 def test_reports_sumo_that_stops_answering(town, recorded, tmp_path, monkeypatch):
     monkeypatch.setattr(sumo, "_STEP_TIMEOUT_S", 0.2)

@@ -177,6 +177,7 @@ def test_rejects_input_file_in_the_folder_for_sumo(town, tmp_path):
     assert user_file.is_file()
 
 
+@pytest.mark.slow
 def test_removes_files_of_an_earlier_run(town, tmp_path):
     left = tmp_path / "sumo" / "fcd.csv"
     left.parent.mkdir()
@@ -214,6 +215,7 @@ def crowded_folder(town, tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", [{"sumocfg": "own.sumocfg"}, {"network": "net.xml", "routes": ["own.rou.xml"]}])
 def test_user_demand_is_simulated_unchanged(crowded_folder, source):
     result = run_stage(traffic, scenario(crowded_folder, **source, **FIVE_FRAMES), crowded_folder / "out")
@@ -263,6 +265,7 @@ def test_flags_have_no_absolute_path_and_fcd_file_is_removed(recorded):
     assert "fcd.csv" not in names
 
 
+@pytest.mark.slow
 def test_user_configuration_runs_with_times_and_outputs_of_the_scenario(town, tmp_path):
     scene = scenario_with_config(town, tmp_path / "in")
     result = run_stage(traffic, scene, tmp_path / "out")

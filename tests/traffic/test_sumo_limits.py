@@ -23,6 +23,7 @@ NO_VEHICLES = limits.Limit("EGVS_MAX_VEHICLES", 0, "vehicles", "the vehicles and
 LINUX = sys.platform.startswith("linux")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not LINUX, reason="elsewhere the processor time of other processes is not known")
 def test_idle_sumo_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_sumo(tmp_path, monkeypatch, "exec sleep 1000")

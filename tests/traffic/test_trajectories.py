@@ -62,6 +62,7 @@ def test_vehicles_stay_on_the_roads_and_do_not_jump(recorded):
         assert np.hypot(np.diff(x[mine]), np.diff(y[mine])).max(initial=0) < 6  # 0.25 s at less than 24 m/s
 
 
+@pytest.mark.slow
 def test_rejects_permanent_jam(town, tmp_path):
     """All signals of the town stay red."""
     text = (town / "net.xml").read_text()
@@ -89,6 +90,7 @@ def test_rejects_more_vehicles_than_fit(town, tmp_path):
     assert 0 < result["vehicles"]["most"] < 200
 
 
+@pytest.mark.slow
 def test_rejects_traffic_without_vehicles(town, tmp_path):
     (tmp_path / "none.rou.xml").write_text("<routes/>")
     keys = SMALL | {"routes": ["none.rou.xml"], "hold": "at_most"}
@@ -98,6 +100,7 @@ def test_rejects_traffic_without_vehicles(town, tmp_path):
         run_stage(traffic, scenario(tmp_path, network="net.xml", **keys), tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_rejects_density_above_the_capacity_of_the_network(town, tmp_path):
     keys = {"network": "net.xml", "frames": 40, "warmup_s": 60.0, "vehicles_per_lane_km": 100.0}
     with pytest.raises(

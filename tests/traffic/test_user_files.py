@@ -189,6 +189,7 @@ _ENTITIES = "".join(f'<!ENTITY {c} "{f"&{b};" * 10}">' for b, c in zip("abcdefgh
 BOMB = f'<!DOCTYPE routes [<!ENTITY a "{"0123456789" * 5}">{_ENTITIES}]><routes><vType id="&j;"/></routes>'
 
 
+@pytest.mark.slow
 def test_options_of_a_configuration_write_no_file(demand_folder, tmp_path):
     foreign = tmp_path / "foreign.txt"
     options = "".join(f'<{key} value="{foreign}"/>' for key in OPTIONS)
@@ -196,6 +197,7 @@ def test_options_of_a_configuration_write_no_file(demand_folder, tmp_path):
     assert foreign.read_text() == FOREIGN_TEXT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("written", ["abroad", "artefact", "own folder"])
 def test_outputs_of_an_additional_file_are_not_written(demand_folder, town, tmp_path, written):
     foreign = tmp_path / "foreign.txt"
@@ -221,6 +223,7 @@ def test_outputs_of_an_additional_file_are_not_written(demand_folder, town, tmp_
     )
 
 
+@pytest.mark.slow
 def test_outputs_of_a_route_file_are_not_written(demand_folder, tmp_path):
     foreign = tmp_path / "foreign.txt"
     param = f'<param key="has.ssm.device" value="true"/><param key="device.ssm.file" value="{foreign}"/>'
@@ -232,6 +235,7 @@ def test_outputs_of_a_route_file_are_not_written(demand_folder, tmp_path):
     assert foreign.read_text() == FOREIGN_TEXT
 
 
+@pytest.mark.slow
 def test_outputs_of_a_network_are_not_written(demand_folder, tmp_path):
     foreign = tmp_path / "foreign.txt"
     text = (demand_folder / "net.xml").read_text()

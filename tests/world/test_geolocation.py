@@ -45,6 +45,7 @@ def with_location(folder: Path, projection: str, offset: str = "-550000.00,-5634
 UTM = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("map_file", [SMALL, pytest.param(REAL, marks=pytest.mark.skipif(
     not REAL.is_file(), reason="bad_hersfeld.osm is not beside the checkout (shared/real)"))])  # fmt: skip

@@ -268,6 +268,7 @@ def test_error_at_feet_of_poles_is_below_1_mm(height_m):
 COARSE = st.tuples(*[st.integers(0, 8).map(lambda v: v * 1.25)] * 3)
 
 
+@pytest.mark.slow
 @settings(derandomize=True, max_examples=60, deadline=None)
 @given(corners=st.lists(st.tuples(COARSE, COARSE, COARSE), min_size=1, max_size=25), start=COARSE)
 def test_lattice_scenes_agree_with_brute_force(corners, start):
@@ -423,6 +424,7 @@ def test_shipped_scene_agrees_with_brute_force(name, site):
     assert scan.ambiguous < 0.01 * len(scan.beam)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.int64, np.float32])
 def test_ends_are_float64_for_other_types_of_directions(dtype):
     wall = quad((10.3, 0, 0), (10.3, 9, 0), (10.3, 9, 9), (10.3, 0, 9))
@@ -474,6 +476,7 @@ def test_can_meet_box_is_exact_for_chords_at_the_limit():
     np.testing.assert_array_equal(result[:2000], true[:2000])
 
 
+@pytest.mark.slow
 def test_select_beams_agrees_with_can_meet_box():
     """The beams that are cast, of a whole turn, from within the region, above it, beside it and far away."""
     size, d = np.array([40.0, 20.0, 5.0]), random_directions(np.random.default_rng(3), 20_011)

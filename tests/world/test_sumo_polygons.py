@@ -514,6 +514,7 @@ def test_rejects_two_locations(tmp_path: Path) -> None:
 # ---- a file that polyconvert made
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_reads_output_of_polyconvert(tmp_path: Path) -> None:
     """The corners of each building lie where the network says, at the heights of the map."""

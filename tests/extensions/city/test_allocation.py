@@ -67,6 +67,7 @@ def test_allocates_count_optimally(junctions: list[JunctionPlans], count: int) -
         assert bound >= value
 
 
+@pytest.mark.slow
 @given(junctions(), st.integers(1, 40))
 def test_allocates_budget_optimally(junctions: list[JunctionPlans], budget: int) -> None:
     allocated = allocation.allocate_budget(junctions, float(budget))

@@ -142,6 +142,7 @@ def read_solids(folder: Path) -> dict[str, dict]:
     return {feature["properties"]["name"]: feature for feature in features}
 
 
+@pytest.mark.slow
 def test_nearby_streets_give_same_poles_as_all_streets(extract: Path) -> None:
     read = osm.read_osm(extract)
     _, streets, _ = street_network.build_network(
@@ -154,6 +155,7 @@ def test_nearby_streets_give_same_poles_as_all_streets(extract: Path) -> None:
         assert junctions.kerbside_poles(near, junction, roi, []) == junctions.kerbside_poles(streets, junction, roi, [])
 
 
+@pytest.mark.slow
 def test_network_excerpt_keeps_streets(extract: Path, tmp_path: Path) -> None:
     read = osm.read_osm(extract)
     text, streets, _ = street_network.build_network(
@@ -222,6 +224,7 @@ def test_selects_junctions_of_table(extract: Path, tmp_path: Path) -> None:
     assert model.load_city(again.folder).junctions == read.junctions
 
 
+@pytest.mark.slow
 def test_radius_limits_streets_and_junctions(extract: Path, tmp_path: Path) -> None:
     city = creation.create_city(tmp_path / "town", extract, NewCityOptions(around=degrees(-200, 0), radius_m=250.0))
     assert [new.junction.names[0] for new in city.junctions] == ["A Road"]
@@ -229,6 +232,7 @@ def test_radius_limits_streets_and_junctions(extract: Path, tmp_path: Path) -> N
     assert city.streets.lane_length_m < 2 * (500 + 300 + 300) + 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rows", "message"),
     [

@@ -158,6 +158,7 @@ def count_tasks(dask_worker: Any) -> int:
     return sum(str(key).startswith("wait_for_release") for key in dask_worker.state.tasks)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_process_cluster")
 def test_failed_simulation_cancels_tasks_and_leaves_nothing(
     city: City, client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

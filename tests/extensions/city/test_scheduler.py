@@ -35,6 +35,7 @@ def make_jobs(count: int) -> list[Job]:
     return [Job(f"j{i}", Path(f"/city/j{i}"), Path(f"/out/j{i}")) for i in range(count)]
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(1, 2**28), min_size=1, max_size=60), st.integers(1, 64))
 def test_graph_has_every_junction_once(beams: list[int], workers: int) -> None:
     all_jobs = make_jobs(len(beams))

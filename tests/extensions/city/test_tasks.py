@@ -137,6 +137,7 @@ def test_cache_drops_scene_unless_in_use(jobs: list[Job]) -> None:
     cache.drop("token", jobs[0])
 
 
+@pytest.mark.slow
 def test_waits_for_folder_that_lost_worker_uses(jobs: list[Job]) -> None:
     settings = scheduler.make_run_settings()
     is_locked, release = threading.Event(), threading.Event()

@@ -212,6 +212,7 @@ length_s = 20.0
 """
 
 
+@pytest.mark.slow
 def test_splits_each_period(city: City) -> None:
     toml, night = city.folder / "city.toml", city.folder / "night.csv"
     scenario_file, plain = city.junctions[0].scenario_folder(city) / "scenario.toml", toml.read_text()

@@ -113,6 +113,7 @@ def test_names_full_disk(requirements: Requirements) -> None:
     assert text == f"{requirements.writable}: expected at least 32 MB of free disk space, got 1.5 MB"
 
 
+@pytest.mark.slow
 def test_source_digest_sees_every_file(other_version: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also effects and schemas, which are found by name; a wheel and a checkout of the same source are equal."""
     package = other_version / "egvs"

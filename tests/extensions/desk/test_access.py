@@ -21,6 +21,7 @@ def refusal(status: int, headers: dict[str, str], body: bytes) -> None:
     assert headers["content-type"].startswith("text/plain")
 
 
+@pytest.mark.slow
 def test_address_with_key_sets_a_cookie_and_hides_the_key(desk: Client) -> None:
     status, headers, _ = desk.raw("GET", "/?" + desk.address.partition("?")[2], headers={"Cookie": ""})
     assert (status, headers["location"]) == (303, "/")

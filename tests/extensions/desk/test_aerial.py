@@ -137,6 +137,7 @@ def test_other_pictures_are_refused_with_the_reason(town: Client, tmp_path: Path
     assert not list((tmp_path / "scratch").iterdir())
 
 
+@pytest.mark.slow
 def test_a_picture_that_is_a_link_is_not_sent(town: Client, tmp_path: Path) -> None:
     folder = tmp_path / "work" / "town"
     (tmp_path / "secret").write_text("secret")

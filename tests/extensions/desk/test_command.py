@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("command", ["desk", "explore"])
 def test_opens_the_page_over_the_present_folder(command: str, tmp_path: Path) -> None:

@@ -123,6 +123,7 @@ def test_sentences_have_the_loss_that_the_plan_states(planned: tuple[StageContex
         assert texts[sensor.site] == [f"Vehicles that only this sensor finds: {share}."]
 
 
+@pytest.mark.slow
 def test_joint_score_is_that_of_a_run_with_the_other_sensor(
     planned: tuple[StageContext, SensorPlan], tmp_path: Path
 ) -> None:

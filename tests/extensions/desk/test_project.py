@@ -68,6 +68,7 @@ def test_shows_the_map(town: Client) -> None:
         assert solid["outline_m"][0][0] == solid["outline_m"][0][-1]
 
 
+@pytest.mark.slow
 def test_adds_moves_edits_and_removes_a_pole(town: Client, tmp_path: Path) -> None:
     before = read(tmp_path, "sites.csv")
     assert town.ok("POST", "/api/sites", {"x_m": "211,5", "y_m": 211})["site"] == "new1"
@@ -93,6 +94,7 @@ def test_adds_moves_edits_and_removes_a_pole(town: Client, tmp_path: Path) -> No
     assert load(tmp_path / "work" / "town").placement.excluded == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("x_m", "y_m", "reason"),
     [
@@ -146,6 +148,7 @@ def test_unknown_poles_are_refused(town: Client) -> None:
     assert town.refused("DELETE", "/api/sites/nobody")[0] == 404
 
 
+@pytest.mark.slow
 def test_names_stay_text(town: Client) -> None:
     name = "<img src=x onerror=alert(1)>"
     assert town.ok("POST", "/api/sites", {"x_m": 211, "y_m": 211, "site": name})["site"] == name
@@ -155,6 +158,7 @@ def test_names_stay_text(town: Client) -> None:
     town.ok("DELETE", "/api/sites/%3Cimg%20src=x%20onerror=alert(1)%3E")
 
 
+@pytest.mark.slow
 def test_counts_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
     (before,) = town.project["counts"]
     town.ok("PUT", "/api/counts", {"counts": {"0": "120", "1": "45,5"}})
@@ -175,6 +179,7 @@ def test_counts_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
     assert town.refused("PUT", "/api/counts", {"counts": [1]})[0] == 422
 
 
+@pytest.mark.slow
 def test_more_vehicles_than_lanes_carry_are_said_at_once(town: Client) -> None:
     approach = town.ok("PUT", "/api/counts", {"counts": {"0": "2500"}})["project"]["counts"][0]["approaches"][0]
     assert approach["limit_per_h"] < 2500
@@ -182,6 +187,7 @@ def test_more_vehicles_than_lanes_carry_are_said_at_once(town: Client) -> None:
     assert "exceed" in approach["problem"] + movement["problem"]
 
 
+@pytest.mark.slow
 def test_settings_keep_comments(town: Client, tmp_path: Path) -> None:
     town.ok(
         "PUT", "/api/settings", {"frames": "500", "warmup_s": 60, "heights_m": ["4", 6], "pitch_deg": ["-5", "aim"]}
@@ -194,6 +200,7 @@ def test_settings_keep_comments(town: Client, tmp_path: Path) -> None:
         assert town.refused("PUT", "/api/settings", body)[0] == 422
 
 
+@pytest.mark.slow
 def test_costs_say_what_plans_cost(town: Client, tmp_path: Path) -> None:
     sensor = town.project["mounts"]["sensor"]
     unknown = {"pole_cost": 0, "sensor_costs": {sensor: None}, "least": None, "most": None, "most_sensors": 12}
@@ -212,6 +219,7 @@ def test_costs_say_what_plans_cost(town: Client, tmp_path: Path) -> None:
         assert town.refused("PUT", "/api/settings", {"sensor_costs": wrong})[0] == 422
 
 
+@pytest.mark.slow
 def test_last_pole_takes_the_sensor_of_all_along(town: Client, tmp_path: Path) -> None:
     for name in ("signal1", "lamp1"):
         town.ok("PATCH", f"/api/sites/{name}", {"sensor": "OS1-128"})
@@ -219,6 +227,7 @@ def test_last_pole_takes_the_sensor_of_all_along(town: Client, tmp_path: Path) -
     assert {each.sensor for each in candidate_sites(load(tmp_path / "work" / "town"))} == {"OS1-128"}
 
 
+@pytest.mark.slow
 def test_undo_and_redo_restore_every_byte(town: Client, tmp_path: Path) -> None:
     folder = tmp_path / "work" / "town"
 
@@ -243,6 +252,7 @@ def test_undo_and_redo_restore_every_byte(town: Client, tmp_path: Path) -> None:
     assert town.refused("POST", "/api/redo", {})[0] == 409
 
 
+@pytest.mark.slow
 def test_edits_by_hand_are_taken_over_and_can_be_undone(town: Client, tmp_path: Path) -> None:
     path = tmp_path / "work" / "town" / "sites.csv"
     before = path.read_text()
@@ -257,12 +267,14 @@ def test_edits_by_hand_are_taken_over_and_can_be_undone(town: Client, tmp_path: 
     assert (path.read_text(), town.project["problem"]) == (before, "")
 
 
+@pytest.mark.slow
 def test_suggests_kerbs(town: Client) -> None:
     poles = town.ok("GET", "/api/suggestions")["poles"]
     assert len(poles) > 4
     assert all(town.ok("POST", "/api/sites/check", pole)["ok"] for pole in poles)
 
 
+@pytest.mark.slow
 def test_a_rule_of_sites_cannot_be_edited(town: Client) -> None:
     town.ok("POST", "/api/copy", {"shipped": "nishishinjuku", "name": "copy"})
     project = town.project
@@ -275,10 +287,12 @@ def test_a_rule_of_sites_cannot_be_edited(town: Client) -> None:
     assert town.refused("GET", "/api/map")[0] == 409
 
 
+@pytest.mark.slow
 def test_check_says_what_the_command_says(town: Client) -> None:
     assert town.ok("GET", "/api/check") == {"errors": [], "warnings": []}
 
 
+@pytest.mark.slow
 def test_signals_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
     (signal,) = town.project["signals"]
     streets = [{row["approach"] for row in phase["green"]} for phase in signal["phases"]]
@@ -301,6 +315,7 @@ def test_signals_are_written_to_the_table(town: Client, tmp_path: Path) -> None:
     assert town.refused("PUT", "/api/signals", {**times, "green_s": []})[0] == 409
 
 
+@pytest.mark.slow
 def test_counts_of_a_period_are_in_its_table(town: Client, tmp_path: Path) -> None:
     write_periods(tmp_path / "work" / "town")
     morning, evening = town.project["counts"]
@@ -317,6 +332,7 @@ def test_counts_of_a_period_are_in_its_table(town: Client, tmp_path: Path) -> No
     assert town.project["counts"][1] == evening
 
 
+@pytest.mark.slow
 def test_obstacles_are_a_table_of_the_scenario(town: Client, tmp_path: Path) -> None:
     before = read(tmp_path, "scenario.toml")
     lorry = {"name": "lorry1", "kind": "lorry", "x_m": 190, "y_m": "203,5", "yaw_deg": 0}
@@ -343,6 +359,7 @@ def packed(**files: str) -> bytes:
     return data.getvalue()
 
 
+@pytest.mark.slow
 def test_archives_of_others_are_checked(desk: Client, tmp_path: Path) -> None:
     before = sorted(tmp_path.rglob("*"))
     for archive in (

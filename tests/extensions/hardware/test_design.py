@@ -91,6 +91,7 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, DesignResu
     return path, design(path, folder / "run", channels=8, elevation_evaluations=150)
 
 
+@pytest.mark.slow
 def test_elevations_concentrate_on_the_lane(designed: tuple[Path, DesignResult]) -> None:
     result = designed[1]
     assert result.start is not None and result.designed is not None
@@ -151,6 +152,7 @@ def test_scores_are_those_of_the_other_frames(designed: tuple[Path, DesignResult
     assert result.designed.difference.value == pytest.approx(result.designed.score - result.catalogue[0].score)
 
 
+@pytest.mark.slow
 def test_seed_and_scenario_determine_the_design(designed: tuple[Path, DesignResult], tmp_path: Path) -> None:
     path, result = designed
     request = DesignRequest("pole_a", ("coarse",), None, 20, 8, ELEVATION_BOUNDS_DEG, 150)
@@ -259,6 +261,7 @@ def test_scores_of_several_seeds_are_those_of_each_simulation(tmp_path: Path) ->
     assert chosen.se == pytest.approx(math.sqrt(of_traffic + ((cluster - pointpillars) / 2) ** 2))
 
 
+@pytest.mark.slow
 def test_sensor_hangs_as_at_the_sites_of_the_pole(tmp_path: Path, run_egvs: Any) -> None:
     """Its own mount, although another sensor is at the site; the row that is printed gives the score of the search."""
     path = one_lane(tmp_path)
@@ -324,6 +327,7 @@ def test_search_starts_at_the_elevations_of_the_sensor() -> None:
     assert start_elevations(own, 3, (-10.0, 0.0)) == (-10.0, -5.5, -1.0)
 
 
+@pytest.mark.slow
 def test_designs_are_scored_with_losses(tmp_path: Path) -> None:
     """Also where the rule would leave them out: 13 m to the lane, and 600 m rated at 10 %."""
     path = one_lane(tmp_path)

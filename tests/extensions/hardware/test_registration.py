@@ -38,6 +38,7 @@ def test_recovers_known_pose() -> None:
     assert 0.005 < fit.sigma_m < 0.02  # range noise of 2 cm, times the cosine of the incidence
 
 
+@pytest.mark.slow
 def test_standard_errors_match_scatter() -> None:
     surfaces = StaticSurfaces(yard(), YARD_POSE.position_m)
     scaled = []
@@ -128,6 +129,7 @@ def test_ground_fixes_height_and_tilt_only() -> None:
     assert np.abs(errors(fit.pose, truth)).max() < 0.01
 
 
+@pytest.mark.slow
 def test_finds_yaw() -> None:
     surfaces = StaticSurfaces(yard(), YARD_POSE.position_m)
     search = search_yaw(yard_scan(coarse_sensor()), surfaces, replace(START, yaw_deg=0.0))
@@ -136,6 +138,7 @@ def test_finds_yaw() -> None:
     assert search.alternatives[0].excess_m > 5 * search.alternatives[0].excess_se_m
 
 
+@pytest.mark.slow
 def test_square_room_has_four_yaws() -> None:
     truth = Pose(0.0, 0.0, 4.0, 20.0, 0.0, 0.0)
     search = search_yaw(room_scan(truth, *SQUARE), StaticSurfaces(room(*SQUARE), truth.position_m), truth)

@@ -63,6 +63,7 @@ def test_prints_recording_and_rotation(tmp_path: Path, run_egvs: Any) -> None:
     assert rotation["azimuth_step_deg"] == pytest.approx(1.2, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_rejects_unknown_topic(tmp_path: Path, run_egvs: Any) -> None:
     pytest.importorskip("rosbags")
@@ -104,6 +105,7 @@ def test_rejects_option(
     assert [path.name for path in tmp_path.iterdir()] == ["sweep.ply"]
 
 
+@pytest.mark.slow
 def test_rejects_cloud_without_rings(tmp_path: Path, run_egvs: Any) -> None:
     path = tmp_path / "cloud.ply"
     ply.write(path, np.random.default_rng(0).normal(size=(4000, 3)) * (20.0, 20.0, 5.0))

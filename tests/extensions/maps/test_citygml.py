@@ -104,6 +104,7 @@ def test_objects_outside_the_window_are_left_out(tmp_path: Path) -> None:
         )
 
 
+@pytest.mark.slow
 def test_alignment_places_a_model_in_a_system_that_proj_does_not_know(tmp_path: Path) -> None:
     """A triangle 30 m long and 9 high, in metres and in feet."""
     ring = [(0.0, 0.0, 9.0), (30.0, 0.0, 9.0), (30.0, 30.0, 9.0)]
@@ -118,6 +119,7 @@ def test_alignment_places_a_model_in_a_system_that_proj_does_not_know(tmp_path: 
         citygml.read_solids([path], CONTEXT)
 
 
+@pytest.mark.slow
 def test_swapped_axes_are_an_error(tmp_path: Path) -> None:
     lon, lat = FRAME.to_degrees(np.array([[0.0, 0.0]]))[0].tolist()
     ring = [(lon, lat, 1.0), (lon + 1e-4, lat, 1.0), (lon, lat + 1e-4, 2.0)]
@@ -192,6 +194,7 @@ def test_templates_are_placed_along_the_axes_of_the_file(tmp_path: Path) -> None
     assert "1 reference leads to no surface in the same object." in result.notes
 
 
+@pytest.mark.slow
 def test_templates_at_degrees_keep_their_size(tmp_path: Path) -> None:
     lon, lat = FRAME.to_degrees(np.array([[20.0, 30.0]]))[0].tolist()
     path = write_model(tmp_path / "a.gml", implicit("lamp", (lat, lon, 3.0), TEMPLATE), srs_name="EPSG:6697")
@@ -303,6 +306,7 @@ def real() -> tuple[MapContext, citygml.SolidMap]:
     return context, citygml.read_solids([SHARED], context)
 
 
+@pytest.mark.slow
 def test_real_buildings_and_their_heights(real: tuple[MapContext, citygml.SolidMap]) -> None:
     _, result = real
     heights = {mesh.name[4:8]: float(np.ptp(mesh.vertices_m[:, 2])) for mesh in result.meshes}

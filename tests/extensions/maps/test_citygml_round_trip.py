@@ -88,6 +88,7 @@ def test_visibility_of_every_voxel_is_the_same(tmp_path: Path, voxel_m: float) -
     assert np.count_nonzero(before != after) <= 1e-5 * before.size
 
 
+@pytest.mark.slow
 def test_visibility_tells_a_shift_of_ten_centimetres(tmp_path: Path) -> None:
     """What the other test could not tell otherwise."""
     scenario = loading.load(SCENARIO)

@@ -47,6 +47,7 @@ def densified(shape_m: FloatArray, step_m: float = 0.5) -> FloatArray:
     return np.concatenate(pieces)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_heights_on_a_plane_are_exact(tmp_path: Path) -> None:
     draped = drape_network(build(tmp_path), PLANE, (150.0, 0.0))
@@ -108,6 +109,7 @@ def test_bridge_runs_straight_over_the_valley(tmp_path: Path) -> None:
     assert any("In 4 places, roads cross without a junction" in note for note in on_ground.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_node_amid_a_bridge_hangs_between_its_ends(tmp_path: Path) -> None:
     """A bridge of 100 m and 200 m from b over c to d: c lies a third of the way down from b to d."""
@@ -165,6 +167,7 @@ def test_shifted_heights_change_nothing_else(tmp_path: Path) -> None:
     assert without == text
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_bridge_of_a_map_is_an_edge_of_its_own(tmp_path: Path) -> None:
     """Main leads over Low by the bridge 2, which netconvert would merge with the streets 1 and 3."""

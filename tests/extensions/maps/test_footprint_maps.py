@@ -130,6 +130,7 @@ def test_declared_system_and_local_metres(tmp_path: Path) -> None:
     np.testing.assert_allclose(solid.geometry.bounds, (30, 0, 50, 10), atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".gpkg", ".shp", ".parquet"])
 def test_gis_files(tmp_path: Path, suffix: str) -> None:
     geopandas = pytest.importorskip("geopandas", reason="needs the extra gis")
@@ -179,6 +180,7 @@ def test_a_system_whose_geoid_grid_is_missing_places_footprints(tmp_path: Path) 
     np.testing.assert_allclose(solid.geometry.bounds, (20, 30, 30, 40), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_an_alignment_replaces_a_system_that_proj_does_not_know(tmp_path: Path) -> None:
     path = write(tmp_path / "a.geojson", feature([[0, 0], [9, 0], [9, 9], [0, 0]]), crs=named("Town grid"))
     points = np.array([[0.0, 0.0], [50.0, 0.0]])

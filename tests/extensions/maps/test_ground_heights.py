@@ -35,6 +35,7 @@ def test_raster_in_the_projection_of_the_network(tmp_path: Path) -> None:
     assert terrain.notes == (f"{tmp_path}/a.tif: terrain of 8 x 12 cells, 99.4 to 103.4 m high.",)
 
 
+@pytest.mark.slow
 def test_raster_in_degrees(tmp_path: Path) -> None:
     """A plane in UTM, sampled on a fine grid of degrees: the error of a cell of 1 m is below a centimetre."""
     rasterio = pytest.importorskip("rasterio")
@@ -68,6 +69,7 @@ def test_tiles_complete_each_other(tmp_path: Path) -> None:
     assert [note.rpartition(";")[2] for note in terrain.notes] == [" 48 cells have no data.", " 40 cells have no data."]
 
 
+@pytest.mark.slow
 def test_share_without_heights_is_reported(tmp_path: Path) -> None:
     path = write_tiff(tmp_path / "a.tif", plane_cells())
     terrain = rasters.read_terrain([path], MapContext(FRAME, box(0, 0, 240, 80)))
@@ -87,6 +89,7 @@ def test_local_grid_needs_an_alignment(tmp_path: Path) -> None:
     assert terrain.height_m(np.array([[30.0, 20.0], [20.0, 45.0]])) == pytest.approx([2.0, 7.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("context", "message"), [
     (MapContext(FRAME, box(5000, 5000, 5100, 5100)), "the terrain has no height in the region"),
     (MapContext(None, WINDOW), "the road map has no reference system"),
@@ -118,6 +121,7 @@ def slow_tin_height(vertices: FloatArray, faces: np.ndarray, x: float, y: float)
     return min(heights, default=math.nan)
 
 
+@pytest.mark.slow
 def test_triangles_against_one_by_one() -> None:
     from scipy.spatial import Delaunay
 
@@ -219,6 +223,7 @@ def test_alignment_that_no_file_needs_is_rejected() -> None:
     check_used(MapContext(FRAME, WINDOW))
 
 
+@pytest.mark.slow
 def test_impossible_heights_are_rejected(tmp_path: Path) -> None:
     """-9999 that the file does not declare as unknown, and a damaged number."""
     cells = plane_cells()

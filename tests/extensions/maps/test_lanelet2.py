@@ -244,6 +244,7 @@ def test_turns_have_the_directions_of_the_map(tmp_path: Path) -> None:
         assert directions[f"road_{crossing.into[0]}", f"road_{crossing.out_of[turned]}"] == direction
 
 
+@pytest.mark.slow
 def test_lefthand_traffic_is_recognised(tmp_path: Path) -> None:
     path = make_crossing(lefthand=True).writer.write(tmp_path / "map.osm")
     built = build(path)
@@ -256,6 +257,7 @@ def test_lefthand_traffic_is_recognised(tmp_path: Path) -> None:
         build(right, lefthand=True)
 
 
+@pytest.mark.slow
 def test_kerb_lane_is_lane_0_on_both_sides(tmp_path: Path) -> None:
     for lefthand in (False, True):
         sign = -1.0 if lefthand else 1.0
@@ -274,6 +276,7 @@ def test_kerb_lane_is_lane_0_on_both_sides(tmp_path: Path) -> None:
         assert len(built.network.edges) == 2
 
 
+@pytest.mark.slow
 def test_preserves_heights_and_makes_no_junctions_of_bridges(tmp_path: Path) -> None:
     writer = MapWriter()
 
@@ -312,6 +315,7 @@ def test_position_on_the_earth_is_stated(tmp_path: Path) -> None:
     assert lon_deg == pytest.approx(first.lon_deg, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_speed_limits(tmp_path: Path) -> None:
     crossing = make_crossing()
     lanelets = crossing.writer.lanelets
@@ -329,6 +333,7 @@ def test_speed_limits(tmp_path: Path) -> None:
         build(crossing.writer.write(tmp_path / "map.osm"))
 
 
+@pytest.mark.slow
 def test_assumed_classes_are_counted_once(tmp_path: Path) -> None:
     """The roads of a map with a ring are converted twice."""
     path = ROOT / "scenarios" / "roundabout" / "network.net.xml"
@@ -338,6 +343,7 @@ def test_assumed_classes_are_counted_once(tmp_path: Path) -> None:
     assert sum(map(int, counts)) == len(built.network.edges)
 
 
+@pytest.mark.slow
 def test_permissions(tmp_path: Path) -> None:
     crossing = make_crossing()
     crossing.writer.lanelets[crossing.into[0]][2]["subtype"] = "bus_lane"
@@ -368,6 +374,7 @@ def test_markings_decide_on_lane_changes(tmp_path: Path) -> None:
     assert changes({"type": "curbstone", "lane_change": "yes"}) == [True, True]
 
 
+@pytest.mark.slow
 def test_lane_that_nothing_leads_to_can_be_reached(tmp_path: Path) -> None:
     """One lane becomes two behind a solid line: without a change, nobody could turn right."""
     crossing = make_crossing()
@@ -395,6 +402,7 @@ def test_two_way_lanelet_becomes_two_roads(tmp_path: Path) -> None:
     assert built.note("Lanelets open in both directions: 1")
 
 
+@pytest.mark.slow
 def test_reversed_lanelet_is_reported(tmp_path: Path) -> None:
     crossing = make_crossing()
     left, right, tags, regulations = crossing.writer.lanelets[crossing.into[2]]
@@ -405,6 +413,7 @@ def test_reversed_lanelet_is_reported(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_lanelets_cut_at_the_edge_of_the_map_stay_connected(tmp_path: Path) -> None:
     crossing = make_crossing()
     del crossing.writer.lanelets[crossing.out_of[1]]
@@ -417,6 +426,7 @@ def test_lanelets_cut_at_the_edge_of_the_map_stay_connected(tmp_path: Path) -> N
     assert not [note for note in built.roads.notes if "in no connection" in note]
 
 
+@pytest.mark.slow
 def test_long_loop_road_is_cut(tmp_path: Path) -> None:
     """A road that leaves a crossing in the east and comes back from the south would be a loop at one node."""
     crossing = make_crossing()
@@ -451,6 +461,7 @@ def signalised_crossing(tmp_path: Path, *, refer: bool) -> tuple[BuiltMap, list[
     return build(crossing.writer.write(tmp_path / "map.osm")), lights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("refer", [True, False])
 def test_lights_form_groups_by_regulatory_element(tmp_path: Path, refer: bool) -> None:
     built, lights = signalised_crossing(tmp_path, refer=refer)
@@ -470,6 +481,7 @@ def test_lights_form_groups_by_regulatory_element(tmp_path: Path, refer: bool) -
     assert len(lights) == 4
 
 
+@pytest.mark.slow
 def test_signalised_crossing_carries_traffic(tmp_path: Path) -> None:
     built, _ = signalised_crossing(tmp_path, refer=True)
     assert drive(built, tmp_path) == (50, 0, 0)
@@ -492,6 +504,7 @@ def responses(built: BuiltMap) -> dict[tuple[str, str], set[tuple[str, str]]]:
     return {roads[i]: {roads[j] for j, bit in enumerate(row) if bit == "1"} for i, row in enumerate(bits)}
 
 
+@pytest.mark.slow
 def test_right_of_way_is_that_of_the_map(tmp_path: Path) -> None:
     """Straight on from the north meets straight on from the east: the map decides who yields."""
     ways = {}
@@ -508,6 +521,7 @@ def test_right_of_way_is_that_of_the_map(tmp_path: Path) -> None:
     assert ways == {0: (False, True), 1: (True, False)}
 
 
+@pytest.mark.slow
 def test_contradictory_and_unused_rules(tmp_path: Path) -> None:
     crossing = make_crossing()
     for prior, yielding in ((0, 1), (1, 0)):
@@ -520,6 +534,7 @@ def test_contradictory_and_unused_rules(tmp_path: Path) -> None:
     assert not [note for note in built.roads.notes if note.startswith("Right of way as")]
 
 
+@pytest.mark.slow
 def test_all_way_stop(tmp_path: Path) -> None:
     crossing = make_crossing()
     crossing.writer.regulation([("relation", crossing.into[arm], "yield") for arm in range(4)], "all_way_stop")
@@ -546,6 +561,7 @@ def crossings(built: BuiltMap) -> list[ElementTree.Element]:
     return [edge for edge in built.root.findall("edge") if edge.get("function") == "crossing"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("along_m", "lefthand"), [(15.0, False), (15.0, True), (10.0, False)])
 def test_crosswalks_at_a_junction(tmp_path: Path, along_m: float, lefthand: bool) -> None:
     built = crossing_with_zebras(tmp_path, along_m, lefthand=lefthand)
@@ -567,6 +583,7 @@ def test_crosswalks_at_a_junction(tmp_path: Path, along_m: float, lefthand: bool
         assert np.hypot(*edge.lanes[1].shape_m[-1][:2]) >= (17.3 if along_m == 15.0 else 11.8)
 
 
+@pytest.mark.slow
 def test_crosswalk_amid_a_road_cuts_it(tmp_path: Path) -> None:
     built = crossing_with_zebras(tmp_path, 50.0)
     assert len(crossings(built)) == 4
@@ -576,6 +593,7 @@ def test_crosswalk_amid_a_road_cuts_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(lengths_m, [19.5] * 8 + [35.5] * 8, atol=0.3)
 
 
+@pytest.mark.slow
 def test_crosswalks_at_lights_get_a_phase(tmp_path: Path) -> None:
     built = crossing_with_zebras(tmp_path, 15.0, lights=True)
     (logic,) = built.root.iter("tlLogic")
@@ -587,6 +605,7 @@ def test_crosswalks_at_lights_get_a_phase(tmp_path: Path) -> None:
     assert drive(built, tmp_path) == (50, 0, 0)
 
 
+@pytest.mark.slow
 def test_pedestrians_walk_over_crosswalks(tmp_path: Path) -> None:
     built = crossing_with_zebras(tmp_path, 15.0)
     tmp_path.joinpath("net.net.xml").write_text(built.roads.network, encoding="utf-8")
@@ -609,6 +628,7 @@ def test_without_crosswalks_there_are_no_sidewalks(tmp_path: Path) -> None:
     assert all(len(edge.lanes) == 1 for edge in built.network.edges)
 
 
+@pytest.mark.slow
 def test_carriageways_that_leave_the_map_together_are_one_arm(tmp_path: Path) -> None:
     def nodes(gap_m: float, height_m: float) -> int:
         writer = MapWriter()
@@ -638,6 +658,7 @@ def test_recognises_lanelet2_files(tmp_path: Path) -> None:
     assert not lanelet2.can_open(other, other.read_bytes())
 
 
+@pytest.mark.slow
 def test_same_map_gives_the_same_text(tmp_path: Path) -> None:
     path = make_crossing().writer.write(tmp_path / "map.osm")
     first, second = build(path).roads, build(path).roads

@@ -51,6 +51,7 @@ def read_mutants(folder: Path, name: str, seeds: range) -> tuple[int, int]:
     return read, rejected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KINDS)
 def test_some_mutants(tmp_path: Path, name: str) -> None:
     read, rejected = read_mutants(tmp_path, name, range(12))

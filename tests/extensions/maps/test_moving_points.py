@@ -47,6 +47,7 @@ def on_box(points: FloatArray, centre: tuple[float, float, float]) -> np.ndarray
     return inside.all(axis=1) & (points[:, 2] > 0.3)
 
 
+@pytest.mark.slow
 def test_car_that_passes_is_removed_from_sweeps() -> None:
     """Ten sweeps from one place; the car is at another place in each."""
     centres = [(-18.0 + 4.5 * i, 8.0, 0.75) for i in range(10)]
@@ -59,6 +60,7 @@ def test_car_that_passes_is_removed_from_sweeps() -> None:
         assert mask[~car].mean() < 0.01
 
 
+@pytest.mark.slow
 def test_car_that_stays_is_not_removed_from_sweeps() -> None:
     sweeps = [scan(world(WALL, (CAR, (0.0, 8.0, 0.75))), (0.0, -5.0, 3.0), i) for i in range(10)]
     for sweep, mask in zip(sweeps, not_shared(sweeps), strict=True):

@@ -69,6 +69,7 @@ def lanes(roads: Network) -> dict[str, network.Lane]:
     return {f"{edge.id}_{index}": lane for edge in roads.edges for index, lane in enumerate(edge.lanes)}
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_second_lane_that_leads_to_one_is_added(tmp_path: Path) -> None:
     road_map, roads = convert(tmp_path, maps.merge())
@@ -82,6 +83,7 @@ def test_second_lane_that_leads_to_one_is_added(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_text_has_no_date_and_no_path(tmp_path: Path) -> None:
     first = convert(tmp_path, maps.merge())[0].network
@@ -102,6 +104,7 @@ def test_connections_of_lanes_without_links_are_guesses(tmp_path: Path) -> None:
     assert expected in road_map.notes
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_patch_removes_connections(tmp_path: Path) -> None:
     roads = convert(tmp_path, maps.merge())[1]
@@ -141,6 +144,7 @@ def test_reports_connections_that_contradict_the_map(tmp_path: Path) -> None:
     assert found.lost_lanes == () and found.lanes == 4 and max(found.off_m.values()) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_lane_drop_is_reported(tmp_path: Path) -> None:
     road_map, roads = convert(tmp_path, maps.lane_drop())
@@ -174,6 +178,7 @@ def test_preserves_elevation_and_reports_superelevation(tmp_path: Path) -> None:
     assert "The slope across 2 roads (superelevation) is left out: 1, 2." in road_map.notes
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_signals_become_lights_and_signs_are_counted(tmp_path: Path) -> None:
     light = (
@@ -208,6 +213,7 @@ def test_one_junction_in_pieces_is_one_signal(tmp_path: Path) -> None:
     assert [junction.id for junction in roads.junctions if junction.type == "traffic_light"] == ["9"]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_road_over_another_is_reported(tmp_path: Path) -> None:
     """Road 2 crosses road 1 in its middle, 6 m higher."""
@@ -407,6 +413,7 @@ def test_only_lanes_for_vehicles_are_imported(tmp_path: Path) -> None:
     assert lanes(roads)["-1_0"].shape_m[:, 1].tolist() == [-1.75, -1.75]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_with_walk_other_lanes_are_closed_to_cars(tmp_path: Path) -> None:
     road_map, roads = convert(tmp_path, beside("shoulder biking sidewalk parking"), walk=True)

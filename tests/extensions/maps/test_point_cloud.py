@@ -95,6 +95,7 @@ def test_files_that_are_point_clouds(name: str, head: bytes, expected: bool) -> 
 # --- what is read and said ---
 
 
+@pytest.mark.slow
 def test_house_on_a_plane(survey: list[Path]) -> None:
     """Two meshes, of which the ground is flat and the objects are as high as the house, 6 m; the car is gone."""
     result = point_cloud.read_solids(survey, CONTEXT)
@@ -119,6 +120,7 @@ def vertices_in_car(mesh: MappedMesh) -> int:
     return int(np.count_nonzero(inside.all(axis=1) & (mesh.vertices_m[:, 2] > 0.3)))
 
 
+@pytest.mark.slow
 def test_same_files_give_the_same_bytes(survey: list[Path]) -> None:
     first, second = (point_cloud.read_solids(survey, CONTEXT) for _ in range(2))
     for one, other in zip(first.meshes, second.meshes, strict=True):
@@ -237,6 +239,7 @@ def test_heights_in_feet_and_points_marked_as_noise(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 @needs_laspy
 @pytest.mark.parametrize("text", ["Local", '""', "NOT A SYSTEM[]"])
 def test_alignment_places_a_file_whose_reference_system_is_no_text_of_one(tmp_path: Path, text: str) -> None:
@@ -330,6 +333,7 @@ def test_mutants_are_read_or_rejected_with_one_message(
 # --- what sites see of it ---
 
 
+@pytest.mark.slow
 def test_one_station_is_a_world_for_that_place_only(survey: list[Path]) -> None:
     """Behind the house nobody has measured: a site there looks into unseen space, a site at the station does not."""
     result = point_cloud.read_solids(survey[1:2], CONTEXT)
@@ -358,6 +362,7 @@ def differences(true: World, as_built: AsBuiltMap, roi: Roi, sites_m: FloatArray
     return np.array([np.mean(expected != actual) for expected, actual in seen])
 
 
+@pytest.mark.slow
 def test_visibility_of_a_house_on_a_plane(survey: list[Path]) -> None:
     """2 % of the points differ in the mean, 4 % at the worst site, as for a junction."""
     result = point_cloud.read_solids(survey, CONTEXT)

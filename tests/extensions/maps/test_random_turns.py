@@ -137,6 +137,7 @@ def test_turn_between_roads_that_do_not_meet_is_reported(tmp_path: Path) -> None
     assert "Turns between these roads are missing: 3 to 2." in road_map.notes
 
 
+@pytest.mark.slow
 def test_position_tells_the_side_of_lanelets_without_opposite_ones(tmp_path: Path) -> None:
     crossing = make_crossing()
     for number in (*crossing.out_of.values(), *crossing.turns.values()):

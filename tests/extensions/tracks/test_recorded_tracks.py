@@ -61,6 +61,7 @@ def make_tpog(run_egvs, folder: Path, out: Path) -> None:
         assert run_egvs(stage, folder, "--out", out)[0] == 0
 
 
+@pytest.mark.slow
 def test_tracks_give_the_same_trajectories_and_tpog_as_fcd(mini: Path, run_egvs, tmp_path: Path) -> None:
     """Positions agree to a micrometre, all counts of the TPOG exactly."""
     make_tpog(run_egvs, mini, tmp_path / "fcd")
@@ -78,6 +79,7 @@ def test_tracks_give_the_same_trajectories_and_tpog_as_fcd(mini: Path, run_egvs,
     )
 
 
+@pytest.mark.slow
 def test_clock_of_the_recording_does_not_matter(mini: Path, run_egvs, tmp_path: Path) -> None:
     for start_s in (0.0, 1.6e9):
         use_tracks(mini, interaction_csv(boxes_of_fcd(), start_s))
@@ -293,6 +295,7 @@ default_type = "car"
 """
 
 
+@pytest.mark.slow
 def test_own_table_gives_the_same_tpog(mini: Path, run_egvs, tmp_path: Path) -> None:
     """The same boxes with other names of columns, and headings clockwise from north in degrees."""
     use_tracks(mini, interaction_csv(boxes_of_fcd()))
@@ -323,6 +326,7 @@ def test_long_gap_is_unknown_and_not_empty(mini: Path, run_egvs, tmp_path: Path)
     assert stages["tpog"].summary["scaled_voxels"] + stages["tpog"].summary["unknown_voxels"] > 0
 
 
+@pytest.mark.slow
 def test_short_gap_is_interpolated(mini: Path, run_egvs, tmp_path: Path) -> None:
     """Cars on a straight line: without two rows of one car, the trajectories are the same."""
     use_tracks(mini, interaction_csv(boxes_of_fcd()))
@@ -352,6 +356,7 @@ def simulated(folder: Path, text: str) -> None:
     (folder / "scenario.toml").write_text(scenario.replace("center_m = [20, 0, 2.5]", "center_m = [60, 60, 2.5]"))
 
 
+@pytest.mark.slow
 def test_recorded_pedestrians_walk_beside_simulated_vehicles(mini: Path, run_egvs, tmp_path: Path) -> None:
     """At frame k the pedestrian is at x = 1.2 k: the warm-up of the simulation shifts nothing."""
     simulated(mini, walkers(41))
@@ -367,6 +372,7 @@ def test_recorded_pedestrians_walk_beside_simulated_vehicles(mini: Path, run_egv
     assert "recorded pedestrians" in [warning["rule"] for warning in summary["warnings"]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [

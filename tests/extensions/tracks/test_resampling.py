@@ -94,6 +94,7 @@ def slow_positions(
     return positions
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.integers(0, 60), min_size=2, max_size=25, unique=True),
     st.lists(st.integers(0, 60), min_size=1, max_size=25, unique=True),

@@ -310,6 +310,7 @@ def test_keys_that_contradict(keys: dict[str, Any], expected: str) -> None:
         mapping(**keys)
 
 
+@pytest.mark.slow
 @needs_karlsruhe
 def test_mapping_reads_karlsruhe_as_its_reader_does() -> None:
     path = REAL / "karlsruhe_k733" / "vehicle_tracks_000.csv.gz"

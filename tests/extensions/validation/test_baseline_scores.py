@@ -65,6 +65,7 @@ def test_nuc_leaves_out_what_is_not_on_the_ground():
     assert with_sidewalk == pytest.approx(counts.std() / (5 * p), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [50, 6500])
 def test_nuc_equals_slow_twin(count):
     """The released program's loops: each disc against each return."""

@@ -282,6 +282,7 @@ def test_removes_files_of_killed_export_and_fills_empty_folder(four_sites, tmp_p
     assert not list(tmp_path.glob(".out*"))
 
 
+@pytest.mark.slow
 def test_run_folder_stands_for_its_scenario(mini, tmp_path, run_egvs):
     assert run_egvs("run", mini, "--out", tmp_path / "run")[0] == 0
     for number, path in enumerate((mini, tmp_path / "run")):
@@ -306,6 +307,7 @@ def test_long_vehicles_without_class_are_no_cars(four_sites, tmp_path, run_egvs)
     assert about["by_size"] == about["classes"] == {"Bus": int(said[1])}
 
 
+@pytest.mark.slow
 def test_python_function_writes_the_files_of_the_command(four_sites, tmp_path, run_egvs):
     words = ("--site", "level", "--frames", "2", "--format", "ply")
     assert run_egvs("clouds", four_sites, "--out", tmp_path / "one", *words)[0] == 0

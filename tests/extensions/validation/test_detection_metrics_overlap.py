@@ -61,6 +61,7 @@ def hostile_pairs(count):
     return boxes
 
 
+@pytest.mark.slow
 def test_overlap_equals_shapely():
     a, b = hostile_pairs(PAIRS)
     overlap, expected = paired_overlap(a, b), by_shapely(a, b)

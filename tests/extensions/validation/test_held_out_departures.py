@@ -16,6 +16,7 @@ from tests.traffic.helpers import netgenerate, scenario
 from tests.traffic.test_departures import write_demand
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "demand",
     [

@@ -75,6 +75,7 @@ def test_writes_artefacts(validated):
     assert json.loads(egvs_row["parameters"]) == {"gamma": 4, "voxel_m": 0.5, "moving_occlusion": False}
 
 
+@pytest.mark.slow
 def test_detects_flipped_bit(validated, tmp_path):
     out = shutil.copytree(validated[1], tmp_path / "out")
     assert read_validation(RunFolder(out)) is not None

@@ -80,6 +80,7 @@ def test_points_come_from_traffic_of_tpog(computed):
         assert values(scores, "points_on_target")[one.name] == points_on_target(visible)
 
 
+@pytest.mark.slow
 def test_bytes_do_not_depend_on_threads(computed, tmp_path):
     scenario, _, scores = computed
     again = compute_surrogates(scenario, tmp_path / "work", jobs=3)
@@ -150,6 +151,7 @@ def test_rejects_invalid_plugin_and_lists_its_problem(site: Path, source, proble
     assert entry.score is None and entry.package == "somebody-elses" and problem in entry.problem
 
 
+@pytest.mark.slow
 def test_skips_unloadable_score_with_warning(computed, tmp_path, site: Path):  # noqa: F811
     install(
         site, "somebody-elses", "wrong = plug_wrong:S", {"plug_wrong": "raise RuntimeError"}, surrogates.SCORES_GROUP

@@ -37,6 +37,7 @@ def test_organised_sweep_gives_all_angles() -> None:
     assert np.abs(angles.offset_m - expected_m).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_clockwise_sweep() -> None:
     """A mirror turns the sensor the other way round; azimuth offsets change sign."""
     points = sweep_of(TRUTH) * (1.0, -1.0, 1.0)
@@ -78,6 +79,7 @@ def test_field_of_view(is_list: bool) -> None:
     assert azimuth_deg.max() == pytest.approx(70.0 + expected.max(), abs=3.0 if is_list else 1e-3)
 
 
+@pytest.mark.slow
 def test_channels_share_offsets_of_one_line() -> None:
     """40 channels whose own offsets are known to 5 mm, on the line -0.03 tan(e) with deviations of 0 or 20 mm.
 
@@ -134,6 +136,7 @@ def test_needs_a_sweep_finer_than_float16() -> None:
         fit_beam_angles([Sweep("coarse", sweep_of(TRUTH), is_coarse=True)])
 
 
+@pytest.mark.slow
 def test_rejects_sweep_of_another_sensor() -> None:
     other = sweep_of(Truth(), CATALOGUE["VLP-16"])
     with pytest.raises(InputError, match=r"b: .* none of the rings of the first sweep"):

@@ -59,6 +59,7 @@ def test_recovers_yaw(yaw_deg: float) -> None:
     assert result.warnings == ()
 
 
+@pytest.mark.slow
 def test_equal_walls_are_ambiguous() -> None:
     truth = Pose(3.0, -2.0, 4.0, 20.0)
     square = ((-9.0, 15.0), (-14.0, 10.0))  # 12 m to each side
@@ -69,6 +70,7 @@ def test_equal_walls_are_ambiguous() -> None:
     assert message.startswith("Ambiguous: the sweep fits as well at a yaw of ")
 
 
+@pytest.mark.slow
 def test_ground_alone_fixes_no_yaw() -> None:
     truth = Pose(0.0, 0.0, 4.0, 20.0)
     endless = (-np.inf, np.inf)
@@ -77,6 +79,7 @@ def test_ground_alone_fixes_no_yaw() -> None:
     assert result.best.standard_errors["yaw_deg"] == np.inf
 
 
+@pytest.mark.slow
 def test_says_that_corridor_has_no_end() -> None:
     truth = Pose(0.0, 0.0, 4.0, 20.0)
     walls = ((-np.inf, np.inf), (-8.0, 5.0))
@@ -84,6 +87,7 @@ def test_says_that_corridor_has_no_end() -> None:
     assert "No surface of the static world fixes x, which kept the start value." in result.warnings
 
 
+@pytest.mark.slow
 def test_returns_elsewhere_are_counted() -> None:
     points = yard_scan(coarse_sensor())
     ahead = np.abs(np.degrees(np.arctan2(points[:, 1], points[:, 0]))) < 60.0
@@ -105,6 +109,7 @@ def test_height_of_ground() -> None:
         lowest_surface_m(mesh_of([slope]), 11.0, 0.0)
 
 
+@pytest.mark.slow
 def test_figure_shows_other_yaws() -> None:
     truth = Pose(0.0, 0.0, 4.0, 20.0)
     square = ((-12.0, 12.0), (-12.0, 12.0))

@@ -58,6 +58,7 @@ def test_field_of_view_is_written() -> None:
     assert angle.max() < 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view_deg", [(-50.0, 70.0), (130.0, 260.0), (-240.0, 30.0)])
 def test_view_of_a_list_is_within_the_limits_of_its_key(view_deg: tuple[float, float]) -> None:
     points = sweep_of(TRUTH, small_sensor(view_deg))
@@ -124,6 +125,7 @@ def test_empty_scan_is_upright(tmp_path: Path, four_sweeps: SensorFit) -> None:
     assert np.abs(np.polyfit(lowest[:, 0], lowest[:, 2], 1)[0]) < 2e-3
 
 
+@pytest.mark.slow
 def test_box_in_front_is_traffic(four_sweeps: SensorFit) -> None:
     assert four_sweeps.empty_scan is not None
     in_front = four_sweeps.empty_scan.labels == TRAFFIC

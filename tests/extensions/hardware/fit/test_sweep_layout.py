@@ -24,6 +24,7 @@ def organised() -> FloatArray:
     return sweep_of(TRUTH)
 
 
+@pytest.mark.slow
 def test_channel_fastest(organised: FloatArray) -> None:
     layout = find_layout(organised, "sweep")
     assert (layout.order, layout.channels, layout.silent) == ("channel fastest", CHANNELS, 0)
@@ -31,6 +32,7 @@ def test_channel_fastest(organised: FloatArray) -> None:
     np.testing.assert_array_equal(layout.column, np.repeat(np.arange(AZIMUTHS), CHANNELS))
 
 
+@pytest.mark.slow
 def test_column_fastest(organised: FloatArray) -> None:
     turned = organised.reshape(AZIMUTHS, CHANNELS, 3).transpose(1, 0, 2).reshape(-1, 3)
     layout = find_layout(turned, "sweep")
@@ -39,6 +41,7 @@ def test_column_fastest(organised: FloatArray) -> None:
     np.testing.assert_array_equal(layout.column, np.tile(np.arange(AZIMUTHS), CHANNELS))
 
 
+@pytest.mark.slow
 def test_channel_without_returns_is_counted(organised: FloatArray) -> None:
     points = organised.copy()
     points[3::CHANNELS] = np.nan

@@ -252,6 +252,7 @@ def test_direction_that_no_wall_fixes_fails_the_position() -> None:
     assert (check.passed, check.measured) == (False, "cannot be measured")
 
 
+@pytest.mark.slow
 def test_sensor_that_points_backwards_in_a_symmetric_street_fails_the_yaw() -> None:
     planned, walls_y_m = Pose(0.0, 0.0, 4.0, 20.0, 0.0, 0.0), (-12.0, 12.0)
     surfaces = StaticSurfaces(room(ENDLESS, walls_y_m), planned.position_m)
@@ -387,6 +388,7 @@ SPOILED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SPOILED)
 def test_rejects_scan_that_cannot_be_one(installed: InstalledRun, run_egvs: Any, tmp_path: Path, name: str) -> None:
     spoil, message = SPOILED[name]

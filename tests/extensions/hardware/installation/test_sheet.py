@@ -50,6 +50,7 @@ def test_convergence_is_difference_of_longitude_by_sine_of_latitude() -> None:
     assert sheet.meridian_convergence_deg(UTM32, (0.0, 0.0)) == pytest.approx(expected, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_true_bearing_points_to_where_the_front_points(located: Path) -> None:
     planned = PlannedSites.open(located)
     (name,) = planned.default_sites
@@ -96,6 +97,7 @@ def test_losses_name_the_direction() -> None:
     assert sheet.describe_limit(tilt) == "2.5 degrees"
 
 
+@pytest.mark.slow
 def test_sheet_is_one_page_with_picture_and_map(installed: InstalledRun, tmp_path: Path) -> None:
     ((data, path),) = sheet.write_sheets(installed.folder, ["pole_b"], kind="svg", out=tmp_path)
     root = ET.fromstring(path.read_text())
@@ -146,6 +148,7 @@ def test_camera_looks_along_the_middle_of_a_limited_field_of_view(installed: Ins
     assert (camera.yaw_deg, camera.pitch_deg) == pytest.approx((50.0, -5.0))
 
 
+@pytest.mark.slow
 def test_default_is_the_plan_and_command_prints_tolerances(located: Path, run_egvs: Any, tmp_path: Path) -> None:
     code, printed, _ = run_egvs("sheets", located, "--format", "svg", "--out", tmp_path / "out")
     assert code == 0
@@ -238,12 +241,14 @@ def test_record_of_sheets_leads_to_no_other_file(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.rglob("*.svg")) == ["installation_outside.svg", "notes.svg"]
 
 
+@pytest.mark.slow
 def test_site_may_be_a_pole(spaced: Path, run_egvs: Any, tmp_path: Path) -> None:
     planned = next(name for name in PlannedSites.open(spaced).plan if name.startswith("Ampel Nord@"))
     code, printed, _ = run_egvs("sheets", spaced, "--site", "Ampel Nord", "--format", "svg", "--out", tmp_path)
     assert (code, printed.startswith(planned)) == (0, True)
 
 
+@pytest.mark.slow
 def test_command_is_quoted_and_maker_of_map_is_named(spaced: Path, tmp_path: Path) -> None:
     ((data, path),) = sheet.write_sheets(spaced, ["Mast West"], kind="svg", out=tmp_path)
     words = shlex.split(re.search("egvs accept .*? measured.pcd", sheet_text(path))[0])  # type: ignore[index]

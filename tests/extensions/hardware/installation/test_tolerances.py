@@ -11,6 +11,7 @@ from egvs.extensions.hardware.installation.tolerances import distance_to_one_poi
 from tests.extensions.hardware.installation.conftest import InstalledRun
 
 
+@pytest.mark.slow
 def test_losses_are_those_of_the_moved_sensor(installed: InstalledRun) -> None:
     sites = installed.sites
     site, session = sites.site("pole_a"), sites.session
@@ -43,6 +44,7 @@ def test_distance_is_linear_between_steps(losses: list[tuple[float, float]], exp
     assert distance_to_one_point(losses) == expected
 
 
+@pytest.mark.slow
 def test_poses_below_the_ground_are_left_out(installed: InstalledRun) -> None:
     sites = installed.sites
     site = sites.site("pole_a")

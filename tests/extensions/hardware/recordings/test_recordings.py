@@ -39,6 +39,7 @@ def clouds(count: int) -> list[tuple[float, FloatArray, FloatArray | None]]:
 # ---- recordings of ROS
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("suffix", [".bag", ".mcap", ".db3"])
 def test_messages_are_sweeps(tmp_path: Path, suffix: str) -> None:
@@ -55,6 +56,7 @@ def test_messages_are_sweeps(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(recording.stamps_s, [1000.0, 1000.1, 1000.2], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_folder_of_ros2(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", clouds(2))
@@ -62,6 +64,7 @@ def test_folder_of_ros2(tmp_path: Path) -> None:
     assert len(read_sweeps([tmp_path / "run"])) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_fit_of_recording_is_that_of_its_sweeps(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", clouds(2))
@@ -70,6 +73,7 @@ def test_fit_of_recording_is_that_of_its_sweeps(tmp_path: Path) -> None:
     assert fit.rotation is not None and fit.rotation.rate_hz == pytest.approx(10.0, abs=0.001)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_sweeps_are_spread_over_recording(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", clouds(7))
@@ -81,6 +85,7 @@ def test_sweeps_are_spread_over_recording(tmp_path: Path) -> None:
     assert chosen_sweeps(5, 1).tolist() == [0]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_topic_is_chosen(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", clouds(1), topics=("/rear", "/front"))
@@ -174,6 +179,7 @@ def cylinder(azimuth_deg: FloatArray, elevation_deg: FloatArray) -> FloatArray:
     return np.where((azimuth_deg > 180.0) & (azimuth_deg < 190.0), 0.0, ranges)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_packets_are_turns(tmp_path: Path) -> None:
     write_pcap(tmp_path / "run.pcap", packets(cylinder, turns=3.3))
@@ -219,6 +225,7 @@ def test_fits_packets(tmp_path: Path) -> None:
     assert fit.rotation.step_deg == pytest.approx(0.1990656, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_returns_beyond_200_m_are_kept(tmp_path: Path) -> None:
     """VLP-32C packets: ranges in steps of 4 mm, all of them 230 m; the decoder's default would drop them."""
@@ -277,6 +284,7 @@ def test_list_of_returns_where_slots_are_shared() -> None:
 # ---- messages
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("name", "data", "problem"),
@@ -302,6 +310,7 @@ def test_rejects_missing_file(tmp_path: Path, name: str) -> None:
         read_sweeps([tmp_path / name])
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_rejects_capture_without_turn(tmp_path: Path) -> None:
     write_pcap(tmp_path / "other.pcap", [b"no packet of a sensor"] * 5)

@@ -32,6 +32,7 @@ def test_raster_of_another_kind_is_rejected(watched: Watched, tmp_path: Path, at
     watched.check()
 
 
+@pytest.mark.slow
 def test_overviews_that_a_tiff_names_are_not_opened(watched: Watched, tmp_path: Path) -> None:
     path = tmp_path / "heights.tif"
     transform = rasterio.Affine(10, 0, 500_000, 0, -10, 5_400_000)

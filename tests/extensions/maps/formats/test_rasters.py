@@ -67,6 +67,7 @@ def both(folder: Path, cells: FloatArray) -> list[HeightGrid]:
     return [read_geotiff(tiff, EVERYWHERE), read_ascii_grid(ascii_grid)]
 
 
+@pytest.mark.slow
 def test_plane_is_exact_between_the_middles_of_cells(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     xy = np.column_stack([EAST + rng.uniform(5, 115, 200), NORTH + rng.uniform(5, 75, 200)])
@@ -74,6 +75,7 @@ def test_plane_is_exact_between_the_middles_of_cells(tmp_path: Path) -> None:
         assert grid.height_m(xy) == pytest.approx(plane_m(*xy.T), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_height_is_that_of_the_cell_by_hand(tmp_path: Path) -> None:
     """Four cells 1 2 / 3 4: their common corner is 2.5, three quarters to the right in the lower row 3.75."""
     cells = np.array([[1.0, 2.0], [3.0, 4.0]])
@@ -83,6 +85,7 @@ def test_height_is_that_of_the_cell_by_hand(tmp_path: Path) -> None:
         assert grid.height_m(points + np.array([EAST, NORTH])) == pytest.approx(expected, nan_ok=True)
 
 
+@pytest.mark.slow
 def test_no_data_is_no_height_but_only_where_it_counts(tmp_path: Path) -> None:
     cells = plane_cells()
     cells[3, 4] = np.nan  # its middle is (45, 45) from the corner
@@ -103,6 +106,7 @@ def test_reads_only_the_part_around_a_rectangle(tmp_path: Path) -> None:
     assert read_geotiff(path, (0.0, 0.0, 1.0, 1.0)).heights_m.size == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("profile", "factor"), [
     ({"units": "ft"}, 0.3048), ({"units": "metre"}, 1.0), ({"scale": 0.1}, 0.1),
     ({"crs": "EPSG:32632+5703"}, 1.0), ({"crs": "EPSG:32632+6360"}, 1200 / 3937),
@@ -200,6 +204,7 @@ def _fathoms(path: Path) -> None:
     write_tiff(path, np.zeros((4, 4)), units="fathom")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 @pytest.mark.parametrize(("damage", "message"), [
     (_truncated, "cannot be read as GeoTIFF"), (_text, "cannot be read as GeoTIFF"),
@@ -215,6 +220,7 @@ def test_rejects_broken_tiffs(damage: Callable[[Path], None], message: str, tmp_
     assert message in str(error.value) and "a.tif" in str(error.value)
 
 
+@pytest.mark.slow
 def test_part_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_tiff(tmp_path / "a.tif", plane_cells(30, 30), blockxsize=16, blockysize=16, tiled=True)
     monkeypatch.setenv("EGVS_MAX_POINTS", "500")

@@ -51,6 +51,7 @@ def test_pairs_of_rows_of_a_vehicle() -> None:
     assert lane_speeds._pairs(empty, empty, 2)[0].size == 0
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_speeds_of_a_run(tmp_path: Path) -> None:
     """The slow twin: every pair of positions of every vehicle, one by one."""
@@ -86,6 +87,7 @@ def test_speeds_of_a_run(tmp_path: Path) -> None:
         assert means[lane, 0] == pytest.approx(mean, abs=BIN_M_S / 2)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_page_compares_speeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the eastbound car, one drives and the other stands: the distance is the speed of the one that drives."""

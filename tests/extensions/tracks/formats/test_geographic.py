@@ -30,6 +30,7 @@ def test_aachen_is_in_zone_32_whose_grid_is_turned_there() -> None:
     assert math.atan2(east[1], east[0]) == pytest.approx(turn_rad[0], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_southern_hemisphere_and_other_datum() -> None:
     lon_deg, lat_deg = np.array([151.21]), np.array([-33.87])
     xy_m, frame = to_utm(lon_deg, lat_deg, error)

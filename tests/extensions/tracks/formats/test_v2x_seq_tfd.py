@@ -49,6 +49,7 @@ def test_times_in_other_units(tmp_path: Path, time: str) -> None:
     assert tracks.time_s == pytest.approx([1626155123.9])
 
 
+@pytest.mark.slow
 def test_500_frames(tmp_path: Path) -> None:
     rows = moving_boxes(CLASSES)
     path = write_v2x_seq_tfd(tmp_path, rows)

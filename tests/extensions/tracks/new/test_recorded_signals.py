@@ -125,6 +125,7 @@ def test_cycle_that_ends_in_green_gets_yellow() -> None:
     assert "".join(result) == "r" * 50 + "G" * 20 + "y" * 30
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_program_of_the_network(tmp_path: Path, signals: RecordedSignals) -> None:
     """The recorded cycle from 21 s on, state by state; the junction had no lights before."""
@@ -150,6 +151,7 @@ def test_program_of_the_network(tmp_path: Path, signals: RecordedSignals) -> Non
     sumo.run_program("sumo", ["-n", "plan.net.xml", "--end", "100", "--no-step-log"], tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_scenario_with_recorded_signals(run_egvs, tmp_path: Path) -> None:
     (tmp_path / "map.net.xml").write_text(NETWORK)

@@ -104,6 +104,7 @@ def write_crossing(path: Path) -> Path:
     return write_map(path, nodes, ways)
 
 
+@pytest.mark.slow
 def test_junction_is_that_of_the_tracks(tmp_path: Path) -> None:
     """The car drives from 280 m to 380 m east of the middle, 1.6 m south of the centre line: in its lane."""
     road_map = write_crossing(tmp_path / "map.osm")
@@ -189,6 +190,7 @@ def test_misplaced_tracks_are_reported(run_egvs, tmp_path: Path) -> None:
     assert code == 0 and "Check the coordinate system (traffic.track_crs)" in told
 
 
+@pytest.mark.slow
 def test_errors_of_tracks_name_options(run_egvs, tmp_path: Path) -> None:
     road_map, tracks = write_crossing(tmp_path / "map.osm"), write_tracks(tmp_path / "tracks.csv", x_m=9e5)
     far = run_egvs("new", tmp_path / "new", "--from", road_map, "--tracks", tracks)

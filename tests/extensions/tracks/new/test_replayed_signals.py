@@ -119,6 +119,7 @@ def test_keys_of_the_scenario(tmp_path: Path, run_egvs) -> None:
     assert "signal plans" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_signals_are_guessed_from_vehicles(tmp_path: Path, run_egvs) -> None:
     """25 cars pass the stop line 8.8 to 11.1 s after 10, 30, 50 ... s: in the green around every full 20 s."""
@@ -134,6 +135,7 @@ def test_signals_are_guessed_from_vehicles(tmp_path: Path, run_egvs) -> None:
     assert "which recorded light governs which road" in text
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_signals_are_tested_with_recorded_traffic(tmp_path: Path, run_egvs) -> None:
     """Light 2 is red whenever cars pass, so the groups, or the clocks, are wrong."""
@@ -159,6 +161,7 @@ def crossing_record(name: str) -> SignalRecord:
     return SignalRecord(np.array(times_s), tuple(states), 600.0)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("replay", [None, Replay(60.0, 300.0, 120.0)], ids=["one cycle", "replay"])
 def test_crossings_are_green_while_vehicles_have_red(tmp_path: Path, replay: Replay | None) -> None:
@@ -226,6 +229,7 @@ def test_chongqing(tmp_path: Path) -> None:
     assert clock.cycle_s == pytest.approx(70.0, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_new_scenario_runs_at_once(tmp_path: Path, run_egvs, monkeypatch: pytest.MonkeyPatch) -> None:
     """--run hands the new folder to what egvs run does."""

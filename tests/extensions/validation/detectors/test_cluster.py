@@ -86,6 +86,7 @@ def test_tilted_sensor_detects_same_car(pose):
     assert overlaps(boxes, detector.detect(sweep)).min() > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("slope", "yaw"), [(0.05, 0.9), (-0.08, 0.3)])
 def test_heights_are_measured_from_sloped_ground(slope, yaw):
     boxes = [(20.0, 6.0, *CAR, yaw)]
@@ -101,6 +102,7 @@ def test_separates_two_cars_a_metre_apart():
     assert overlaps(boxes, detections).min() > 0.7
 
 
+@pytest.mark.slow
 def test_completes_car_hidden_by_pole():
     """A column hides the front half of a car that is visible from its side; its rear end is fixed."""
     car = (0.0, 15.0, *CAR, 0.0)
@@ -120,6 +122,7 @@ def test_drops_pedestrian():
     assert len(detector.detect(sweep).boxes) == 0
 
 
+@pytest.mark.slow
 def test_lorry_has_measured_length():
     boxes = [(10.0, 12.0, 10.5, 2.5, 3.7, 0.1)]
     detector, sweep = simulate_sweep(boxes)

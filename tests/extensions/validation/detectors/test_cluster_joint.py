@@ -34,6 +34,7 @@ def test_detects_car_between_two_sensors_once(yaw):
     assert detections.scores[0] > 0.5 * max(single.scores.max() for single in alone)
 
 
+@pytest.mark.slow
 def test_one_sensor_detects_what_is_hidden_from_the_other():
     wall = (0.0, 20.0, 60.0, 0.4, 6.0, 0.0)
     boxes = [(12.0, 5.0, *CAR, 0.4), (-12.0, 26.0, *CAR, 0.4)]
@@ -50,6 +51,7 @@ def test_each_sensor_subtracts_its_own_background():
     assert len(detections.scores) == 0
 
 
+@pytest.mark.slow
 def test_sensor_without_foreground_changes_nothing():
     boxes = [(6.0, 5.0, *CAR, 0.3)]
     far_off = replace(NEAR, x_m=3000.0)
@@ -59,6 +61,7 @@ def test_sensor_without_foreground_changes_nothing():
     np.testing.assert_allclose(detections.scores, alone.scores)
 
 
+@pytest.mark.slow
 def test_empty_sweeps_give_no_detections():
     detector, _ = simulate_sweep([], NEAR)
     joint = Cluster().at_sites([detector.joint.views[0]] * 2, ROI)
@@ -108,6 +111,7 @@ def test_vehicle_visible_from_both_ends_has_measured_length(x_m, size_m):
 LABELS = strategies.lists(strategies.integers(-1, 4), min_size=8, max_size=8)
 
 
+@pytest.mark.slow
 @hypothesis.given(strategies.lists(LABELS, min_size=1, max_size=3))
 def test_merged_labels_are_connected_components(labels):
     merged = _merge_labels([_compact(label) for label in labels])

@@ -50,6 +50,7 @@ def sweep_of(view, boxes):
     return Sweep(np.column_stack([points, np.ones(len(beam))]).astype(np.float32), beam.astype(np.uint32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pose", [Pose(0.0, 0.0, 5.0), Pose(0.0, 0.0, 5.0, 70.0, -8.0, 2.0)])
 def test_car_seen_from_a_corner_gets_its_box(pose):
     """Two sides and the roof of a car give its whole length, width and height, so no margins are needed."""
@@ -138,6 +139,7 @@ def test_no_points_and_few_points_give_nothing():
     assert len(site.detect(sweep_of(view, [])).boxes) == 0
 
 
+@pytest.mark.slow
 def test_same_sweep_gives_same_boxes_after_others():
     view = view_of(Pose(0.0, 0.0, 5.0))
     site, sweep = RangeImage().at_site(view, ROI), sweep_of(view, [CAR])

@@ -28,6 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_prints_tables_and_writes_files(folder: Path, tmp_path: Path, run_egvs: Any) -> None:
     out = tmp_path / "out"
     arguments = ("--against", folder, "--labels", folder, "--sensor", SENSOR, "--detector", "points", "--out", out)
@@ -45,6 +46,7 @@ def test_prints_tables_and_writes_files(folder: Path, tmp_path: Path, run_egvs: 
     assert "16 labelled boxes in 2 sweeps" in page and "http" not in page.split("<body>")[1]
 
 
+@pytest.mark.slow
 def test_without_labels_prints_repetition(folder: Path, run_egvs: Any) -> None:
     code, printed, error = run_egvs("validate", "--against", folder, "--sensor", SENSOR)
     assert code == 0, error
@@ -107,6 +109,7 @@ def test_damaged_tables_are_refused(
     assert code == 2 and message in error and "labels.csv" in error
 
 
+@pytest.mark.slow
 def test_points_of_kitti_are_sweeps(folder: Path, tmp_path: Path, run_egvs: Any) -> None:
     """The same sweep as float32 with an intensity gives the same table."""
     points_m = pcd.read(folder / "sweep0.pcd", "sweep0.pcd")
@@ -246,6 +249,7 @@ def test_other_rings_are_reported_and_nothing_is_fitted(folder: Path, tmp_path: 
     assert f"The nearest sensor of the catalogue is {SENSOR}. No losses are fitted." in printed
 
 
+@pytest.mark.slow
 def test_sensor_may_be_a_file(folder: Path, tmp_path: Path, run_egvs: Any) -> None:
     """The file of a fit, named as it is written; one message for a wrong one."""
     file = tmp_path / "sensor.toml"

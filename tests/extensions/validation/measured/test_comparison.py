@@ -61,6 +61,7 @@ def compared(made: tuple[Path, twin.Twin]) -> Comparison:
     return compare_labelled(ComparisonRequest((folder,), (folder,), SENSOR))
 
 
+@pytest.mark.slow
 def test_known_losses_are_within_the_printed_interval(compared: Comparison) -> None:
     fit = compared.fit
     assert fit is not None and fit.objects == 60
@@ -98,6 +99,7 @@ def test_points_by_range(compared: Comparison) -> None:
     assert cars.with_losses.value < 0.95  # the catalogue's sensor loses more than this one
 
 
+@pytest.mark.slow
 def test_without_losses_simulation_and_sweeps_agree(tmp_path: Path) -> None:
     sweeps = twin.make_twin(None, seed=2)
     request = ComparisonRequest(
@@ -140,6 +142,7 @@ def test_boxes_are_seen_as_in_a_run_with_the_same_sensor(compared: Comparison) -
     assert (there.length_share < without.length_share)[far].all() and (there.hole_m > without.hole_m)[far].all()
 
 
+@pytest.mark.slow
 def test_returns_that_no_range_loses_have_no_fit() -> None:
     """If all beams return, more than the dropout lets, the best limit is the last that is tried: no estimate."""
     rng, per_car = np.random.default_rng(1), 200
@@ -154,6 +157,7 @@ def test_returns_that_no_range_loses_have_no_fit() -> None:
     assert with_losses is not None and with_losses.limit_m == pytest.approx(DEFAULT.limit_m(0.03), rel=0.02)
 
 
+@pytest.mark.slow
 def test_comparison_says_that_the_limit_is_beyond_what_is_tried(tmp_path: Path) -> None:
     sweeps = twin.make_twin(None, seed=3, sweeps=1, cars=8)
     comparison = write_and_compare(tmp_path, twin.write_openlabel(tmp_path, sweeps), sweeps)
@@ -208,6 +212,7 @@ def test_unclear_headings_are_refused(tmp_path: Path, made: tuple[Path, twin.Twi
     assert stated.convention is None
 
 
+@pytest.mark.slow
 def test_conventions_with_the_same_boxes_count_as_one(tmp_path: Path, made: tuple[Path, twin.Twin]) -> None:
     _, sweeps = made
     along = twin.Twin(sweeps.points_m, [boxes.copy() for boxes in sweeps.boxes])

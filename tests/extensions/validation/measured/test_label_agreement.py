@@ -58,6 +58,7 @@ def total(tested: ComparedList, group: str = "cars") -> AgreementRow:
     return next(row for row in tested.rows if row.group == group and row.high == 80.0 and row.low == 0.0)
 
 
+@pytest.mark.slow
 def test_printed_level_is_the_measured_one(tested: list[ComparedList]) -> None:
     for item in tested:
         cars = total(item)
@@ -194,6 +195,7 @@ def test_few_sweeps_say_so(tmp_path: Path, lists: Lists) -> None:
     assert math.isnan(total(first).by_chance.value)
 
 
+@pytest.mark.slow
 def test_lists_of_other_instants_are_refused(tmp_path: Path, folders: tuple[Path, Path], lists: Lists) -> None:
     later = [replace(item, time_s=item.time_s + 5000.0) for item in lists[1]]
     other = two_sensors.write_openlabel(tmp_path / "north", later, POSES[1])
@@ -215,6 +217,7 @@ def test_lists_without_road_users_in_reach_are_refused(tmp_path: Path, lists: Li
             compare_lists(AgreementRequest((path,), of))
 
 
+@pytest.mark.slow
 def test_a_detector_that_finds_nothing_has_no_labelled_area(tmp_path: Path, lists: Lists) -> None:
     labels = lists[0]
     nothing = [replace(item, names=(), classes=(), boxes=np.empty((0, 7))) for item in labels]
@@ -249,6 +252,7 @@ def test_pose_is_recovered_and_shared_frame_detected() -> None:
     assert find_pose(same, "a, b") == SAME
 
 
+@pytest.mark.slow
 def test_prints_tables_and_writes_the_page(folders: tuple[Path, Path], tmp_path: Path, run_egvs: Any) -> None:
     out = tmp_path / "out"
     south, north = folders

@@ -38,6 +38,7 @@ def ground_sweep(seed: int, yaw_deg: float = 0.0) -> Sweep:
     return Sweep(f"sweep{seed}", points_m)
 
 
+@pytest.mark.slow
 def test_rated_range_is_within_the_printed_interval() -> None:
     sweeps = [ground_sweep(1), ground_sweep(2)]
     site = on_ground_plane(CATALOGUE[SENSOR], sweeps)
@@ -61,6 +62,7 @@ def test_moving_things_do_not_count() -> None:
     assert repeated.tolist() == [True, False, False]
 
 
+@pytest.mark.slow
 def test_sweeps_of_other_places_are_refused() -> None:
     sweeps = [ground_sweep(1), Sweep("other", ground_sweep(2).points_m * 1.5)]
     site = on_ground_plane(CATALOGUE[SENSOR], sweeps[:1])
