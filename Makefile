@@ -25,7 +25,7 @@ test: $(VENV)/.installed-dev
 	$(BIN)/python .ci/without.py $(EXTENSIONS) --tests "not slow" --leave-out $(COMPLETE_TESTS)
 	$(BIN)/python -m pytest -m "not slow and complete" --ignore=$(TRAINING) tests/extensions $(COMPLETE_TESTS) $(MIXED_TESTS)
 
-# Sweeps, whole studies, browsers, kills: what takes more than some tenths of a second each.
+# What takes more than 0.2 s each, or has hundreds of cases: sweeps, studies, browsers, kills.
 test-slow: $(VENV)/.installed-dev
 	$(BIN)/python .ci/without.py $(EXTENSIONS) --tests "slow and not nightly" --leave-out $(COMPLETE_TESTS)
 	$(BIN)/python -m pytest -m "slow and not nightly and complete" --ignore=$(TRAINING) tests/extensions $(COMPLETE_TESTS) $(MIXED_TESTS)

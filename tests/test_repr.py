@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 import egvs
 from egvs.sensors.sites import Pose
 
@@ -25,6 +27,7 @@ def test_results_are_one_informative_line(mini: Path, tmp_path: Path) -> None:
     assert repr(score) == f"SiteScore(egvs {score.egvs:,.1f} bit, entropy_seen {100 * score.entropy_seen:.1f} %)"
 
 
+@pytest.mark.slow
 def test_comparison_names_its_runs_and_their_agreement(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\nlow,10,12,3\nhigh,10,12,4.5\nother,30.5,-12,3\n")
     for name in ("first", "second"):

@@ -123,6 +123,7 @@ def test_page_has_the_ranges_over_junctions_and_detectors() -> None:
     assert f"{others[0]:.0f} to {math.ceil(others[-1])} points of AP, and {largest:.0f} once" in page
 
 
+@pytest.mark.slow
 def test_page_has_each_aim_with_its_outcome() -> None:
     page = (DOCS / "validity.md").read_text(encoding="utf-8")
     (aims,) = re.findall(r"^- \*\*\[Aims\].*$", page, re.MULTILINE)

@@ -73,6 +73,7 @@ def test_commands_of_core_import_no_extension(site: Path, run_egvs: Any) -> None
     assert run_egvs("sensors")[0] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "problem"),
     [("COMMANDS = 1 / 0", "its import raised ZeroDivisionError"), ("COMMANDS = ['greet']", "expected a tuple of egvs")],

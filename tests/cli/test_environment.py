@@ -103,6 +103,7 @@ def test_library_that_finds_no_memory_is_no_traceback(capsys: pytest.CaptureFixt
         raise ImportError("no module of this name")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", ["gpkg", "geotiff"])
 def test_full_disk_in_library_that_exports(
     run_egvs: Any, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str

@@ -36,6 +36,7 @@ app.main()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_an_interrupt_during_an_import_is_not_lost(tmp_path: Path) -> None:
     (tmp_path / "swallows.py").write_text(SWALLOWS)

@@ -57,6 +57,7 @@ def hits_equal(scene, pose, sensor, frame):
     return int((owner >= 0).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", POSES)
 @pytest.mark.parametrize("kind", SENSORS)
 def test_ranges_equal_every_beam_against_every_triangle(mini, name, kind):

@@ -242,6 +242,7 @@ def test_points_on_vehicles_are_those_that_scores_expect(mini):
     assert kept[is_glass].sum() < draws * by_score[is_glass].sum() - 4 * math.sqrt(draws * is_glass.sum()) / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "kind"),
     [

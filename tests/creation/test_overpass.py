@@ -109,6 +109,7 @@ def test_redirect_to_another_address_is_followed() -> None:
     assert target.queries == server.queries
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [(), ("--at", "52.0,10.0"), ("--osm", "{file}")])
 def test_nothing_is_requested_without_the_option(
     words: tuple[str, ...], tmp_path: Path, run_egvs: Any, monkeypatch: pytest.MonkeyPatch

@@ -334,6 +334,7 @@ def test_encodings_of_spreadsheets_give_the_same_counts(read: Read, encoding: st
     assert rates(read(*rows, encoding=encoding)) == rates(expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

@@ -126,6 +126,7 @@ def test_plan_states_the_outer_approaches(tmp_path: Path) -> None:
     assert all(program.phases[3].state[index] in "Gg" for index in inner)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("walk", "number"), [(False, 0), (True, 1)])
 def test_signal_of_a_crossing_stays_where_people_walk(tmp_path: Path, walk: bool, number: int) -> None:
     found = read_signals(tmp_path, build(tmp_path, {13: CROSSWALK | SIGNAL}, walk=walk))

@@ -134,6 +134,7 @@ def test_a_map_format_of_another_package_is_read(tmp_path: Path) -> None:
     assert code == 2 and "site.walls: the format of the file is unknown" in text and "OpenStreetMap" in text, text
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_package_with_a_former_group_gets_one_message(tmp_path: Path) -> None:
     files = package("A map format")

@@ -20,6 +20,7 @@ from tests.effects.detect_helpers import (
 )
 
 
+@pytest.mark.slow
 @given(
     visibility_m,
     visibility_m,

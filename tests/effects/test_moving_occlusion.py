@@ -519,6 +519,7 @@ def test_reads_only_row_groups_with_replayed_frames(ran: tuple[Path, Path], monk
     assert complete.values.tolist() == parts.values.tolist() and len(parts.values) == 2
 
 
+@pytest.mark.slow
 def test_boxes_beyond_sites_and_region_occlude_nothing(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     boxes, before = trajectories(out), scores(folder, out, ON, ALL)
@@ -542,6 +543,7 @@ def test_vehicle_between_site_and_region_occludes(ran: tuple[Path, Path]) -> Non
     assert 0.95 * plain[1] < other <= plain[1]
 
 
+@pytest.mark.slow
 def test_scores_are_the_same_without_stored_scans(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     remaining = scores(folder, out, ON)

@@ -79,6 +79,7 @@ def test_every_bicycle_trip_starts_on_time(flat_road, tmp_path):
     assert len(drawn) <= starts <= len(drawn) + slots  # and each vehicle is seen for a moment where it first stands
 
 
+@pytest.mark.slow
 def test_pedestrians_walk_on_sidewalks_in_their_direction(hill_run):
     _, r, out = hill_run
     people = kind_rows(r, "pedestrian")
@@ -199,6 +200,7 @@ def test_people_are_added_to_user_routes(flat_road, tmp_path):
     assert "own" in read_rows(tmp_path / "out")["vehicle"]
 
 
+@pytest.mark.slow
 def test_persons_of_user_routes_do_not_count_as_vehicles(flat_road, tmp_path):
     """Without a file of their own, SUMO writes persons among the vehicles."""
     result = run_stage(traffic, road_scenario(tmp_path, **write_user_demand(flat_road, tmp_path)), tmp_path / "out")

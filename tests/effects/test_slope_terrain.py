@@ -47,6 +47,7 @@ def scenario_in(folder: Path, road: Path, points_m: FloatArray, **keys: Any) -> 
     return scenario_from_dict(values | keys, folder, str(folder / "scenario.toml"))
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_ground_is_the_terrain_beyond_the_roads(flat_road: Path, tmp_path: Path) -> None:
     roads = network.read_net_xml(flat_road / "road.net.xml")

@@ -143,6 +143,7 @@ def matrix(wxyz: tuple[float, float, float, float]) -> np.ndarray:
     return np.column_stack([v + 2 * np.cross(u, np.cross(u, v) + w * v) for v in np.eye(3)])
 
 
+@pytest.mark.slow
 @given(ANGLES)
 def test_quaternion_rotates_like_beams(angles: tuple[float, float, float]) -> None:
     turned = matrix(drawing.pose_quaternion(Pose(0, 0, 0, *angles)))

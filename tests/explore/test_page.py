@@ -66,6 +66,7 @@ def move_and_wait(page: Page, name: str, pose: Pose, sensor: str = "small") -> N
     assert page.wait_until_idle(30)
 
 
+@pytest.mark.slow
 def test_serves_only_this_machine(page: Page) -> None:
     assert page.address.startswith("http://127.0.0.1:")
     assert b"viser" in with_key(page).open(page.origin).read()

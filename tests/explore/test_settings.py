@@ -98,6 +98,7 @@ def test_plan_with_other_gamma_has_its_joint_score(mini: Path, tmp_path: Path) -
     assert tried.plan.joint < session.plan.joint
 
 
+@pytest.mark.slow
 def test_rejects_invalid_settings(session: Session, tmp_path: Path) -> None:
     variants = SessionFactory(session, tmp_path / "scratch")
     with pytest.raises(InputError, match=r"score\.gamma: expected a value greater than or equal to 0 or .*, got -1\.0"):
@@ -107,6 +108,7 @@ def test_rejects_invalid_settings(session: Session, tmp_path: Path) -> None:
     assert variants.session(Settings(2.0, "egvs", frozenset())).scenario.gamma == 2.0
 
 
+@pytest.mark.slow
 def test_offers_effects_that_the_scene_calls_for(mini: Path, tmp_path: Path, session: Session) -> None:
     assert set(offered_effects(session)) == {"divergence", "moving_occlusion"}
     assert trial_parameters("moving_occlusion") == {}

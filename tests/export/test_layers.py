@@ -63,6 +63,7 @@ def test_plan_is_a_layer_until_the_run_changes(planned: Path, tmp_path: Path, ru
     assert not (tmp_path / "b" / "plan.csv").exists()
 
 
+@pytest.mark.slow
 def test_rejects_a_damaged_plan(planned: Path, tmp_path: Path, run_egvs: Call) -> None:
     path = planned / "placement.parquet"
     path.write_bytes(path.read_bytes()[:-9])

@@ -384,6 +384,7 @@ def same(value: Any, expected_layers: Any) -> bool:
     return bool(value == expected_layers)
 
 
+@pytest.mark.slow
 @pytest.mark.system  # SUMO drives in this run
 @pytest.mark.parametrize(
     ("to", "crs"),
@@ -442,6 +443,7 @@ def test_geojson_names_the_reference_system(on_roads: Path, tmp_path: Path) -> N
 
 
 # --- a small KML ---------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_kml_has_footprints_in_range_and_blindspots_of_the_best_on_each_pole(tmp_path: Path) -> None:
     """A barn 150 m away is beyond the 100 m of a VLP-16; each pole has two heights."""
     scenario = write_mini(tmp_path / "mini")

@@ -201,6 +201,7 @@ def test_members_that_cannot_be_files_are_named(tmp_path: Path, names: tuple[str
     assert "egvs-work" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_deep_folders_are_unpacked(tmp_path: Path) -> None:
     path = write_zip(tmp_path / "a.zip", {"d/" * 400 + "b.csv": "x"})
     with unpack_archives([path]) as unpacked:

@@ -316,6 +316,7 @@ def test_projection_as_a_proj_string(crs: str, text: str) -> None:
     assert WorldFrame(found).to_degrees(at) == pytest.approx(there, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_unknown_projection_has_no_proj_string() -> None:
     with pytest.raises(InputError, match="unknown coordinate reference system"):
         georeference.proj_string("nowhere", "map.xodr")

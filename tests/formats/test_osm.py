@@ -42,6 +42,7 @@ def pbf_of(source: Path, path: Path, with_bounds: bool = True) -> Path:
 # --- equal results ---
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a.osm.pbf", "a.osm"])
 def test_pbf_equals_xml_under_any_name(tmp_path: Path, name: str) -> None:
     path = pbf_of(SMALL, tmp_path / name)

@@ -105,6 +105,7 @@ def test_round_trip_is_exact_and_repeats_its_bytes(tmp_path: Path, name: str) ->
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
+@pytest.mark.slow
 @quick
 @given(points=hnp.arrays(np.float64, st.tuples(st.integers(1, 20), st.just(3)), elements=finite))
 @pytest.mark.parametrize("suffix", [".pcd", ".ply"])
@@ -117,6 +118,7 @@ def test_round_trip_keeps_every_finite_float64(
     assert back.tobytes() == points.tobytes()
 
 
+@pytest.mark.slow
 @quick
 @given(points=hnp.arrays(np.float64, st.tuples(st.integers(1, 8), st.just(3)), elements=finite))
 @pytest.mark.parametrize("name", ["a.pcd", "a.ply", "a.csv"])

@@ -80,6 +80,7 @@ def test_geoparquet_has_the_limit_of_geojson(tmp_path: Path, monkeypatch: pytest
     assert len(vector_files.read_gis_file(path, "Polygon")["features"]) == 200_000
 
 
+@pytest.mark.slow
 def test_geoparquet_is_read_by_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = geoparquet(tmp_path / "a.parquet", 10)
     started = []

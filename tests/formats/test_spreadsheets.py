@@ -227,6 +227,7 @@ def test_errors_of_formulas_are_named_in_any_column(tmp_path: Path, suffix: str)
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_archive_of_other_files_is_no_damaged_workbook(tmp_path: Path) -> None:
     path = tmp_path / "t.xlsx"
@@ -347,6 +348,7 @@ def test_number_of_rows_has_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         read_bytes(tmp_path, b"a,b\n1,2\n3,4\n")
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_cell_in_the_last_corner_needs_no_memory(tmp_path: Path) -> None:
     """A range of a million rows and 16,384 columns is rejected."""

@@ -167,6 +167,7 @@ def test_random_box_agrees_with_50_digits(box):
     event(f"flat: {box[4] == 0}; within 1e-9 m of the bound: {bool(unsure)}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pitch", [0.0, 1e-300, 1e-13, 0.02])
 @pytest.mark.parametrize("beside", [-1, 0, 1])
 @pytest.mark.parametrize("eighths", range(-4, 5))

@@ -86,6 +86,7 @@ def test_hard_segment(entry):
         assert agrees_with_exact_march(traversal, o, d, shape, voxel_m)
 
 
+@pytest.mark.slow
 @seldom
 @given(segments())
 def test_random_segment_agrees_with_rational_arithmetic(segment):

@@ -176,6 +176,7 @@ def test_tables_are_consistent(five_candidates: Path, out: Path, run_egvs) -> No
     assert set(json.loads(curve[-1]["sites"])) == {row["site"] for row in rows}
 
 
+@pytest.mark.slow
 def test_budget_pays_each_pole_once_and_forced_sensors_never(five_candidates: Path, out: Path, run_egvs) -> None:
     """A sensor costs 20, a pole 50, a metre 1: a, b and d cost 73, 73 and 74, b_high 75, or 25 beside b; c is 70."""
     costs = ["--set", "costs.sensor.small=20", "--set", "costs.pole=50", "--set", "costs.metre=1"]
@@ -217,6 +218,7 @@ def test_smallest_plan_that_reaches_share(five_candidates: Path, out: Path, run_
     assert max(joint_egvs(five_candidates, out, *names) for names in fewer) < 0.9 * plan["together"]
 
 
+@pytest.mark.slow
 def test_keeps_rules_and_zones(five_candidates: Path, out: Path, run_egvs) -> None:
     sets = ["placement.most_per_pole=1", "placement.excluded=['d']", "placement.least_distance_m=25"]
     arguments = [word for one in sets for word in ("--set", one)]
@@ -547,6 +549,7 @@ def test_bars_of_worst_period_are_shares(three_candidates: Path, tmp_path: Path,
     assert ", by the score in the period with the lowest share, as a share" in page
 
 
+@pytest.mark.slow
 def test_folder_instead_of_file_keeps_old_plan(three_candidates: Path, tmp_path: Path, run_egvs) -> None:
     out = tmp_path / "out"
     run_egvs("place", three_candidates, "--out", out, "--count", 2)
@@ -559,6 +562,7 @@ def test_folder_instead_of_file_keeps_old_plan(three_candidates: Path, tmp_path:
     assert ((out / "placement.parquet").read_bytes(), (out / "placement.sha256").read_bytes()) == before
 
 
+@pytest.mark.slow
 def test_says_that_time_limit_was_reached(three_candidates: Path, tmp_path: Path, run_egvs, monkeypatch) -> None:
     scenario = egvs.load(three_candidates, ["placement.count=2"])
     placed = egvs.place(scenario, tmp_path / "out")

@@ -37,6 +37,7 @@ def describe(finding: Diagnostic, folder: Path) -> tuple[str, str]:
     return where, text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", EACH)
 def test_right_scenario_has_the_scores_of_the_oracle(case: Case, tmp_path: Path) -> None:
     scene = case.make()

@@ -68,6 +68,7 @@ def test_what_if_digest_covers_contents_of_files(run: tuple[Scenario, Path]) -> 
     assert None is not first != what_if_digest(scenario, ["works"])
 
 
+@pytest.mark.slow
 def test_what_if_of_other_traffic_is_not_shown(run: tuple[Scenario, Path]) -> None:
     """The page is the same, byte for byte, as without the file."""
     scenario, out = run

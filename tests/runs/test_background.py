@@ -276,6 +276,7 @@ def test_error_of_check_comes_before_an_earlier_one_of_traffic(tmp_path: Path, m
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["check", "scan"])
 def test_interrupt_ends_sumo(
     tmp_path: Path, simulation: Simulation, monkeypatch: pytest.MonkeyPatch, stage: str
@@ -320,6 +321,7 @@ def test_interrupt_while_the_run_waits_for_sumo(
     assert not (tmp_path / "out" / "sumo").exists()
 
 
+@pytest.mark.slow
 def test_what_a_killed_run_left_is_removed(tmp_path: Path, mini: Path) -> None:
     out = tmp_path / "out"
     run.run(egvs.load(mini), out)

@@ -173,6 +173,7 @@ def test_input_is_recognised_through_link(mini: Path, tmp_path: Path, run_egvs) 
     assert (code, "overwrite tpog.parquet, which the scenario uses (traffic.fcd)" in error) == (2, True)
 
 
+@pytest.mark.slow
 def test_run_inside_scenario_folder_is_allowed(mini: Path, run_egvs) -> None:
     before = tree(mini)
     code, _, error = run_egvs("run", mini, "--out", mini)
@@ -279,6 +280,7 @@ def test_warns_that_scores_are_zero_at_every_site(mini: Path, tmp_path: Path, ru
     assert json.loads((tmp_path / "out" / "run.json").read_text())["stages"]["score"]["summary"]["best"] == []
 
 
+@pytest.mark.slow
 def test_names_are_not_taken_for_markup(mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\n[red]S1,10,12,3\n[x] :car:,30.5,-12,3\n")
     code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out")

@@ -78,6 +78,7 @@ READERS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", REPLACEMENTS)
 @pytest.mark.parametrize(("stage", "artefact"), READERS)
 def test_artefact_replaced_before_its_reader(
@@ -96,6 +97,7 @@ def test_artefact_replaced_before_its_reader(
     assert runs.scores(tmp_path / "clean") == runs.scores(runs.expected)
 
 
+@pytest.mark.slow
 def test_static_world_of_an_earlier_run_replaced_before_it_is_read(runs: TwoRuns, tmp_path: Path) -> None:
     egvs.run(egvs.load(runs.folder), tmp_path / "out")
     finer = egvs.load(runs.folder, ["sensors.small.azimuth_step_deg=2"])

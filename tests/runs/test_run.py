@@ -217,6 +217,7 @@ def test_scoring_again_casts_nothing(done: tuple[Path, Path], monkeypatch: pytes
     assert casts == []
 
 
+@pytest.mark.slow
 def test_scores_are_the_same_without_stored_scans(done: tuple[Path, Path], tmp_path: Path) -> None:
     mini, out = done
     lean = tmp_path / "lean"
@@ -225,6 +226,7 @@ def test_scores_are_the_same_without_stored_scans(done: tuple[Path, Path], tmp_p
     assert egvs.read_scores(lean / "scores.parquet") == egvs.read_scores(out / "scores.parquet")
 
 
+@pytest.mark.slow
 def test_number_of_threads_changes_no_byte(done: tuple[Path, Path], tmp_path: Path) -> None:
     mini, out = done
     for jobs in (1, 3):

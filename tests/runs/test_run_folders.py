@@ -233,6 +233,7 @@ def test_report_of_a_run_folder(here: Path, run_egvs: Any) -> None:
     assert run_egvs("run", OTHER)[::2] == (2, message)
 
 
+@pytest.mark.slow
 def test_folders_without_a_run_are_explained(here: Path, run_egvs: Any) -> None:
     Path("runs/stopped").mkdir(parents=True)
     Path("runs/stopped/.lock").touch()

@@ -243,6 +243,7 @@ def test_a_damaged_entry_is_named_and_made_again(
     assert states(scenario, tmp_path / "third")["tpog"] == "fetched"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", DAMAGE)
 def test_a_damaged_entry_is_cleared(done: tuple[egvs.Scenario, Path], store: Path, run_egvs, case: str) -> None:
     pattern, damage = DAMAGE[case]
@@ -320,6 +321,7 @@ def test_killed_at_some_steps_the_store_is_whole_and_the_next_run_ends_in_the_sa
         assert len(assert_whole(store)) >= len(STAGE_NAMES)
 
 
+@pytest.mark.slow
 def test_the_least_recently_used_entry_is_removed_first(
     done: tuple[egvs.Scenario, Path], store: Path, tmp_path: Path
 ) -> None:
@@ -460,6 +462,7 @@ def test_a_run_does_not_go_into_the_store(
     assert not list(store.iterdir())
 
 
+@pytest.mark.slow
 def test_a_run_prints_which_stages_it_fetched(done: tuple[egvs.Scenario, Path], tmp_path: Path, run_egvs) -> None:
     scenario, _ = done
     code, printed, said = run_egvs("run", scenario.folder, "--out", tmp_path / "other")

@@ -479,6 +479,7 @@ def override(key: str, change: Change) -> str:
     return f"{path.replace('*', '0')}={change.value}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", KEYS)
 def test_another_value_of_a_key_has_an_effect(key: str, small: Path) -> None:
     change = KEYS[key]

@@ -129,6 +129,7 @@ def test_inputs_and_metadata_of_blind_spots(on_roads: tuple[model.Scenario, Path
     assert (site.site, site.off_lanes, site.share_missed.shape) == ("pole_b", 10, (60, 40))
 
 
+@pytest.mark.slow
 def test_another_number_of_threads_writes_the_same_bytes(
     on_roads: tuple[model.Scenario, Path], ran: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -161,6 +162,7 @@ def test_blindspots_can_be_disabled(ran: tuple[Path, Path], tmp_path: Path) -> N
     assert 'data-view="vehicles"' not in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_mix_of_periods_weighs_its_vehicles(tmp_path: Path) -> None:
     halves = '[{name="a", length_s=12, weight=3}, {name="b", begin_s=12, length_s=8}]'
     mini = write_mini(tmp_path / "mini")

@@ -122,6 +122,7 @@ def test_of_a_run(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_of_a_run_with_periods(tmp_path):
     halves = '[{name="a", length_s=12, weight=3}, {name="b", begin_s=12, length_s=8}]'
     scenario = egvs.load(write_mini(tmp_path / "mini"), [f"traffic.periods={halves}", "tpog.blocks=4"])

@@ -107,6 +107,7 @@ def scans_of(rng: np.random.Generator, count: int) -> list[Beams]:
     return [rings(point, seed=int(rng.integers(1000)), count=150) for point in at]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_all_points_thrown_together_give_the_same(seed: int) -> None:
     rng = np.random.default_rng(seed)

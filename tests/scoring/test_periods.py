@@ -130,6 +130,7 @@ def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Pa
     assert run_egvs("verify", tmp_path / "out")[0] == 0
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.tuples(st.integers(1, 999), st.integers(1, 5000)), min_size=1, max_size=4),
     st.sampled_from([1.0, 0.1, 0.01]),
@@ -296,6 +297,7 @@ def test_periods_disagree_without_standard_errors_too(
         assert told in collect_warnings([record.stages["score"].summary]), override
 
 
+@pytest.mark.slow
 def test_report_counts_rows_that_are_not_shown(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = "".join(f"p{n},{10 + n},12,3\n" for n in range(4))
     (split / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}")

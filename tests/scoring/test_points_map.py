@@ -187,6 +187,7 @@ def test_maps_of_a_run_are_drawn_and_exported(mini: Path, tmp_path: Path) -> Non
     assert "The plan: car" in page
 
 
+@pytest.mark.slow
 def test_run_without_network_says_why_there_is_no_map(mini: Path, tmp_path: Path) -> None:
     pytest.importorskip("rasterio", reason="the extra egvs[gis] is not installed")
     import egvs

@@ -68,6 +68,7 @@ def test_target_scores_match_slow_reference(mini: Path, tmp_path: Path, monkeypa
     assert 1.0 <= widened[0] < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", get_args(RankingScore))
 def test_sites_rank_by_named_score(mini: Path, tmp_path: Path, name: str) -> None:
     (mini / "sites.csv").write_text(SITES)
@@ -171,6 +172,7 @@ def test_rejects_region_without_vehicles_for_target_ranking(mini: Path, tmp_path
     assert math.isnan(read_scores(tmp_path / "b" / "scores.parquet")["expected_detections"][0].as_py())
 
 
+@pytest.mark.slow
 def test_warns_of_unknown_standard_errors(mini: Path, tmp_path: Path) -> None:
     """All vehicles are in one block of frames: without it there are none."""
     lines = (mini / "fcd.csv").read_text().splitlines()
@@ -187,6 +189,7 @@ def test_warns_of_unknown_standard_errors(mini: Path, tmp_path: Path) -> None:
     assert "all vehicles in the region are in one of 4 blocks of frames" in doubt.problem
 
 
+@pytest.mark.slow
 def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path) -> None:
     plain = ["score.others=[]", "score.blindspots=false"]
     egvs.run(loading.load(mini, plain), tmp_path, jobs=1)
@@ -281,6 +284,7 @@ def test_terminal_and_report_show_the_score_that_ranks(mini: Path, tmp_path: Pat
     assert run_egvs("verify", tmp_path)[0] == 0
 
 
+@pytest.mark.slow
 def test_the_expected_detections_are_those_of_the_calibration(mini: Path, tmp_path: Path) -> None:
     rows, scenario = run(mini, tmp_path / "run"), loading.load(mini)
     record = TargetRecord.read(tmp_path / "run" / "trajectories.parquet", scenario.roi.grid)

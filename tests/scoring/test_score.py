@@ -77,6 +77,7 @@ def test_scanning_on_the_fly_gives_the_same_scores(mini, tmp_path):
     assert not (tmp_path / "scans.parquet").exists()
 
 
+@pytest.mark.slow
 def test_order_and_company_of_sites_change_no_score(mini, tmp_path):
     rows = ["a,10,12,3,small", "b,30.5,-12,3,small", "c,5,11,6,VLP-16", "d,22,11,2.5,small"]
     found = []

@@ -234,6 +234,7 @@ def test_scores_say_how_sure_they_are(mini: Path, tmp_path: Path) -> None:
         assert scorer.score(scan.beams).replicates[0] == pytest.approx(row["egvs"], rel=1e-12)
 
 
+@pytest.mark.slow
 def test_many_blocks_are_joined_as_they_are_read(mini: Path, tmp_path: Path) -> None:
     """Group by group, what is read from the file is what the blocks add up to."""
     egvs.run(egvs.load(mini, ["traffic.frames=40", "tpog.blocks=40"]), tmp_path)
@@ -252,6 +253,7 @@ def test_many_blocks_are_joined_as_they_are_read(mini: Path, tmp_path: Path) -> 
         assert found[column] == pytest.approx(float(np.minimum(weights, 5) @ entropy), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_rejects_unknown_block(mini: Path, tmp_path: Path) -> None:
     egvs.run(egvs.load(mini), tmp_path)
     path = tmp_path / "tpog.parquet"
@@ -281,6 +283,7 @@ def test_without_errors_the_scores_are_the_same(mini: Path, tmp_path: Path, chan
     assert ranking_table(RankedSite.from_table(plain)).caption is None
 
 
+@pytest.mark.slow
 def test_the_ranking_marks_neighbours_that_are_not_separable(mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\npole_c,10,12,3.001\n")
     code, printed, _ = run_egvs("run", mini, "--out", tmp_path / "out", "--all")

@@ -111,6 +111,7 @@ def test_a_weight_of_one_for_all_changes_nothing(mini: Path, tmp_path: Path) -> 
     assert {site: set(row.items()) for site, row in one.items()} == {s: set(row.items()) for s, row in plain.items()}
 
 
+@pytest.mark.slow
 def test_weights_are_reported(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     weights = ("--set", WEST, "--set", "score.weights.kinds.passenger=2")
     code, printed, told = run_egvs(
@@ -124,6 +125,7 @@ def test_weights_are_reported(mini: Path, tmp_path: Path, run_egvs) -> None:  # 
     assert about["weights"]["kinds"] == {"passenger": 2.0}
 
 
+@pytest.mark.slow
 def test_each_period_is_weighted_separately(mini: Path, tmp_path: Path) -> None:
     halves = 'traffic.periods=[{name="a", length_s=12}, {name="b", begin_s=12, length_s=8}]'
     run(mini, tmp_path / "run", WEST, halves)

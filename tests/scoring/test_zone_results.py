@@ -206,11 +206,13 @@ def test_without_zones_all_other_artefacts_are_the_same(scored: tuple[egvs.Scena
         assert (out / name).read_bytes() == (tmp_path / "plain" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_table_has_the_areas(scored: tuple[egvs.Scenario, Path]) -> None:
     areas = readers.read_zone_areas(scored[1] / "zones.parquet")
     assert [(name, area.bounds) for name, area in areas.items()] == list(ZONES)
 
 
+@pytest.mark.slow
 def test_report_shows_the_zones_of_the_best_site(scored: tuple[egvs.Scenario, Path]) -> None:
     page = (scored[1] / "report.html").read_text().replace("\u00a0", " ")
     rows = readers.read_zones(scored[1] / "zones.parquet", "pole_b")

@@ -80,6 +80,7 @@ class TestCatalogue:
         assert len(sensor.azimuth_offsets_deg) == sensor.channels
         assert sensor.directions().shape == (BEAMS[name], 3)
 
+    @pytest.mark.slow
     def test_order_and_direction(self, name):
         sensor = CATALOGUE[name]
         directions = sensor.directions()

@@ -31,6 +31,7 @@ def count_opens(scenario: egvs.Scenario, out: Path, monkeypatch: pytest.MonkeyPa
     return counts
 
 
+@pytest.mark.slow
 def test_stage_opens_each_artefact_once(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opens = count_opens(egvs.load(mini, SETTINGS), tmp_path / "out", monkeypatch)
     assert opens.keys() >= {

@@ -53,6 +53,7 @@ def test_warns_of_region_without_vehicles(mini: Path, tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_warns_of_vehicles_driving_through_solid(mini: Path, tmp_path: Path) -> None:
     """A wall across the lane of one car, which goes through it at 2 m a second; the house is beside the road."""
     statics(mini, box((20, -3), (22, -1), "wall", kind="wall"), box((14, 5), (18, 8), "house", height_m=6))

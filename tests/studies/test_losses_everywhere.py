@@ -55,6 +55,7 @@ def test_run(mini: Path, tmp_path: Path, by_itself: list[float]) -> None:
     assert note.endswith("Enter rated_range_m and rated_reflectivity under [sensors.small]")
 
 
+@pytest.mark.slow
 def test_sensor_whose_losses_cannot_matter_has_the_bytes_of_before(mini: Path, tmp_path: Path) -> None:
     far = ("sensors.small.rated_range_m=4000", "sensors.small.rated_reflectivity=0.1")
     shares(mini, tmp_path / "far", *far)
@@ -119,6 +120,7 @@ def test_what_if(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert all(with_losses < without for with_losses, without in zip(best[0], best[2], strict=True))
 
 
+@pytest.mark.slow
 def test_explorer(mini: Path, tmp_path: Path, by_itself: list[float]) -> None:
     pytest.importorskip("viser", reason="the extra egvs[explore] is not installed")
     from egvs.explore.settings import Settings, offered_effects, open_session
@@ -136,6 +138,7 @@ def test_explorer(mini: Path, tmp_path: Path, by_itself: list[float]) -> None:
     assert other.apply(egvs.load(mini, (OFF,))).effects.range_limit is False
 
 
+@pytest.mark.slow
 def test_explorer_gives_losses_to_a_sensor_that_moves_away(tmp_path: Path) -> None:
     pytest.importorskip("viser", reason="the extra egvs[explore] is not installed")
     from egvs.explore.settings import open_session

@@ -52,6 +52,7 @@ def test_thinned_beams_score_as_if_each_hit_counted_twice(mini: Path, tmp_path: 
         assert share == pytest.approx((entropy * twice).sum() / (4.0 * entropy.sum()), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_cached_stages_count_with_their_original_time_until_they_are_measured(mini: Path, tmp_path: Path) -> None:
     record = egvs.run(egvs.load(mini), tmp_path / "run")
     runner = make_runner(mini, tmp_path / "out")

@@ -21,6 +21,7 @@ def scores_of(mini: Path, out: Path, *sets: str, sampled_frames: int = 0, by_det
     return score_run(open_folder(scenario, out), WINDOWS, sampled_frames or 40, by_detector=by_detector)
 
 
+@pytest.mark.slow
 def test_vehicle_scores_of_all_frames_are_those_of_a_run(mini: Path, tmp_path: Path) -> None:
     sets = ("score.rank_by=seen_well", "score.others=['expected_detections']")
     scores = scores_of(mini, tmp_path / "run", *sets)
@@ -31,6 +32,7 @@ def test_vehicle_scores_of_all_frames_are_those_of_a_run(mini: Path, tmp_path: P
     assert scores.ranking_score(Window(0, 4)).tolist() == scores.score("seen_well", Window(0, 4)).tolist()
 
 
+@pytest.mark.slow
 def test_parts_and_their_frames_are_weighted_by_vehicles(mini: Path, tmp_path: Path) -> None:
     scores = scores_of(mini, tmp_path / "run")
     halves = [scores.sum_over("expected_detections", window) for window in WINDOWS[1:]]
@@ -42,6 +44,7 @@ def test_parts_and_their_frames_are_weighted_by_vehicles(mini: Path, tmp_path: P
     assert few == pytest.approx(by_hand)
 
 
+@pytest.mark.slow
 def test_threefold_sampling_contains_the_frames_of_the_scenario(mini: Path, tmp_path: Path) -> None:
     sets = ("score.sampled_frames=4", "score.rank_by=expected_detections")
     scores = scores_of(mini, tmp_path / "run", *sets, sampled_frames=12)
@@ -60,6 +63,7 @@ def test_voxel_score_of_a_window_is_that_of_a_run_with_this_traffic(mini: Path, 
         assert scores.ranking_score(window) == pytest.approx(shares, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["entropy_seen", "coverage", "expected_visibility"])
 def test_shares_of_voxels_are_those_of_a_run(mini: Path, tmp_path: Path, name: str) -> None:
     scores = scores_of(mini, tmp_path / "run", f"score.rank_by={name}")
@@ -67,12 +71,14 @@ def test_shares_of_voxels_are_those_of_a_run(mini: Path, tmp_path: Path, name: s
     assert scores.ranking_score(Window(0, 4)) == pytest.approx(table[name].to_numpy(), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_expected_detections_are_the_mean_over_detectors(mini: Path, tmp_path: Path) -> None:
     scores = scores_of(mini, tmp_path / "run", by_detector=True)
     alone = [scores.score(detector_score(detector), Window(0, 4)) for detector in DETECTORS]
     assert scores.score("expected_detections", Window(0, 4)) == pytest.approx(np.mean(alone, axis=0))
 
 
+@pytest.mark.slow
 def test_saved_scores_are_the_same(mini: Path, tmp_path: Path) -> None:
     scores = scores_of(mini, tmp_path / "run")
     again = RunScores.from_json(scores.to_json())

@@ -133,6 +133,7 @@ def test_default_length_of_a_simulation() -> None:
     assert (traffic.frames, traffic.warmup_s) == (5000, 300.0)
 
 
+@pytest.mark.slow
 def test_sizes_from_vtypes_and_sumo_defaults(mini: Path, tmp_path: Path) -> None:
     set_types(mini, "lorry", "DEFAULT_VEHTYPE", "car", "coach")
     expected = vtypes(mini, f"<additional>{LORRY}</additional>",
@@ -159,6 +160,7 @@ def test_sumo_version_is_in_the_cache_key(mini: Path, tmp_path: Path, monkeypatc
     assert len(keys) == 3
 
 
+@pytest.mark.slow
 def test_vtypes_override_the_default_fleet(mini: Path, tmp_path: Path) -> None:
     text = (mini / "scenario.toml").read_text()
     kind = text[text.index("[[traffic.kinds]]") : text.index("[statics]")]

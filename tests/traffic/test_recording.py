@@ -110,6 +110,7 @@ def test_standing_limit_is_two_cycles_or_three_minutes():
     assert recording.standing_limit_s(120) == 240
 
 
+@pytest.mark.slow
 def test_progress_reaches_the_end(town, tmp_path):
     reported = []
     run_stage(
@@ -163,6 +164,7 @@ def test_warns_about_vehicles_that_could_not_start(town, tmp_path):
     assert not (tmp_path / "out" / "sumo" / "statistics.xml").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [0, 8])
 def test_reports_full_disk(town, tmp_path, monkeypatch, blocks):
     """A limit on file size has the effect of a full disk: SUMO ends with exit code 0."""
@@ -201,6 +203,7 @@ def test_rejects_truncated_output(demand_folder, tmp_path, monkeypatch, name, da
         run_stage(traffic, scenario_with_options(demand_folder), tmp_path / "out")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hold", "message"),
     [
@@ -294,6 +297,7 @@ def test_extension_adds_uncounted_traffic_and_changes_boxes(town, tmp_path):
     assert "trips.rou.xml,others.rou.xml" in flags and "--max-num-vehicles 13" in flags
 
 
+@pytest.mark.slow
 def test_two_extensions_add_route_files_and_change_boxes_in_order(town, tmp_path):
     class Others(Guests):
         def plan(self, *arguments):

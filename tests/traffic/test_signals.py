@@ -192,6 +192,7 @@ def test_sumo_shows_the_states_of_the_plan_each_second(crossing, tmp_path):
             assert connection.trafficlight.getRedYellowGreenState("c") == expected[(second - 7) % 60], second
 
 
+@pytest.mark.slow
 def test_summary_names_the_plan(crossing, tmp_path):
     summary = run_stage(traffic, scenario(crossing, {"c": {"phases": [NS, EW]}}), tmp_path / "own")
     (plan,) = summary["signals"]
@@ -250,6 +251,7 @@ def test_plan_of_the_network_is_described_only_in_the_region(crossing):
     assert elsewhere == []
 
 
+@pytest.mark.slow
 def test_signal_of_several_junctions_knows_its_foes(tmp_path):
     """One program for two junctions: positions in the states differ from those of each junction's requests."""
     netgenerate(tmp_path, "--grid", "--grid.x-number", "2", "--grid.y-number", "1", "--grid.length", "60",

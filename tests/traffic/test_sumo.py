@@ -109,6 +109,7 @@ def test_rejects_traci_address_without_server(town, tmp_path):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "answer", [b"", b"HTTP/1.1 400 Bad Request\r\n", b"\0\0\0\5\0", b"\0\0\0\x0b\7\0\0\0\0\0\0", b"\0\0\0\4"]
 )

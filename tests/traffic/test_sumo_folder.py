@@ -223,6 +223,7 @@ def test_user_demand_is_simulated_unchanged(crowded_folder, source):
     assert not {"--max-num-vehicles", "--max-depart-delay"} & set(result["flags"])
 
 
+@pytest.mark.slow
 def test_user_demand_is_limited_on_request(crowded_folder):
     keys = {"sumocfg": "own.sumocfg", "vehicles": 20, "max_depart_delay_s": 7, **FIVE_FRAMES}
     result = run_stage(traffic, scenario(crowded_folder, **keys), crowded_folder / "out")

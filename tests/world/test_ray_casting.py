@@ -212,6 +212,7 @@ def test_no_leak_at_a_closed_box():
     assert np.abs(ranges - box_ranges(o, d, low, high)).max() < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.0), (50.0, 50.0, 5.0)])
 def test_no_leak_at_vertices_and_edges_of_sphere(centre):
     """10,242 vertices and 30,720 edges, aimed at exactly from inside; Embree alone leaks at 34 vertices of the
@@ -243,6 +244,7 @@ def test_no_leak_along_a_surface_of_many_triangles(graze_deg, size_m):
     assert np.abs(ranges - np.linalg.norm(targets - o, axis=1)).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height_m", [2.0, 0.3])
 def test_error_at_feet_of_poles_is_below_1_mm(height_m):
     """Where surfaces stand on each other, a beam may be given the farther of the two only when it is less than 1 mm

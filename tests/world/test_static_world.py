@@ -202,6 +202,7 @@ def test_rejects_site_inside_inverted_but_not_open_solid(tmp_path):
             assert len(check_sites(loaded, world).sites) == 1
 
 
+@pytest.mark.slow
 def test_shipped_statics_are_closed_and_clean():
     for name in ("nishishinjuku", "ingolstadt", "roundabout"):
         world, counts = static_world.build_world(loading.load(f"scenarios/{name}"))

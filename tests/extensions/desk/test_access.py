@@ -29,6 +29,7 @@ def test_address_with_key_sets_a_cookie_and_hides_the_key(desk: Client) -> None:
     assert headers["set-cookie"].startswith(f"egvs_desk_{desk.host.partition(':')[2]}=")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "path", ["/", "/api/state", "/api/events", "/static/main.js", "/api/files/scenario", "/api/aerial", "/?key=x"]
 )
@@ -37,6 +38,7 @@ def test_refuses_without_key(desk: Client, path: str) -> None:
     refusal(*desk.raw("GET", path, headers={"Cookie": desk.cookie[:-1]}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "headers",
     [
@@ -54,11 +56,13 @@ def test_refuses_other_hosts_and_origins(desk: Client, headers: dict[str, str]) 
     refusal(*desk.raw("POST", "/api/undo", b"{}", headers=sent))
 
 
+@pytest.mark.slow
 def test_changes_need_an_origin(desk: Client) -> None:
     refusal(*desk.raw("POST", "/api/open", b'{"scenario": "mini"}', headers={"Origin": ""}))
     assert desk.ok("GET", "/api/state")["project"] is None
 
 
+@pytest.mark.slow
 def test_has_no_websocket(desk: Client) -> None:
     headers = {
         "Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13",
@@ -67,6 +71,7 @@ def test_has_no_websocket(desk: Client) -> None:
     assert desk.raw("GET", "/api/state", headers=headers)[0] != 101
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["/", "/api/state", "/nothing", "/?key=x"])
 def test_every_answer_has_the_policy(desk: Client, path: str) -> None:
     _, headers, _ = desk.raw("GET", path)
@@ -75,6 +80,7 @@ def test_every_answer_has_the_policy(desk: Client, path: str) -> None:
     assert "unsafe" not in POLICY
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -90,6 +96,7 @@ def test_serves_no_file_outside(desk: Client, name: str) -> None:
     assert desk.raw("GET", f"/static/{name}")[0] == 404
 
 
+@pytest.mark.slow
 def test_serves_files_with_their_types(desk: Client) -> None:
     for path, kind in (
         ("/", "text/html"),
@@ -103,18 +110,21 @@ def test_serves_files_with_their_types(desk: Client) -> None:
         assert desk.raw("GET", path, headers={"If-None-Match": headers["etag"]})[0] in (200, 304)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["..", "../mini", "a/../mini", "/etc", "mini/..", ".hidden", "no", "runs", ""])
 def test_opens_no_folder_outside(desk: Client, name: str, tmp_path: Path) -> None:
     (tmp_path / "scenario.toml").write_text((tmp_path / "work" / "mini" / "scenario.toml").read_text())
     assert desk("POST", "/api/open", {"scenario": name})[0] in (404, 422)
 
 
+@pytest.mark.slow
 def test_follows_no_link_out_of_the_folder(desk: Client, tmp_path: Path) -> None:
     (tmp_path / "work" / "mini").rename(tmp_path / "elsewhere")
     (tmp_path / "work" / "link").symlink_to(tmp_path / "elsewhere")
     assert desk.refused("POST", "/api/open", {"scenario": "link"})[0] == 404
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["../up", "a/b", "a\\b", ".x", "x" * 81, "~root", "runs", "a\nb", "mini"])
 def test_makes_no_folder_outside(desk: Client, name: str) -> None:
     status, _, field = desk.refused("POST", "/api/copy", {"shipped": "demo", "name": name})
@@ -136,6 +146,7 @@ def blocks(count: int, sent: list[int]) -> Iterator[bytes]:
         yield b"x" * 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_limits")
 @pytest.mark.parametrize(
     "path", ["/api/maps?name=a.osm", "/api/import?name=a.zip", "/api/aerial?name=a.tif", "/api/sites"]
@@ -155,16 +166,19 @@ def test_large_requests_are_refused_while_they_arrive(desk: Client, tmp_path: Pa
     assert desk.ok("GET", "/api/start")["maps"] == []
 
 
+@pytest.mark.slow
 def test_unknown_kinds_of_files_are_refused(desk: Client) -> None:
     for name in ("map.exe", "", "osm", "map.osm.html"):
         assert desk.refused("POST", f"/api/maps?name={name}", b"x")[0] == 415
 
 
+@pytest.mark.slow
 def test_requests_are_json_objects(desk: Client) -> None:
     for body in (b"{", b"[]", b"\xff", b"[" * 9_000):
         assert desk.raw("POST", "/api/open", body)[0] == 400
 
 
+@pytest.mark.slow
 def test_a_connection_that_sends_nothing_does_not_block_others(desk: Client) -> None:
     host, _, port = desk.host.partition(":")
     with socket.create_connection((host, int(port))) as silent:
@@ -172,6 +186,7 @@ def test_a_connection_that_sends_nothing_does_not_block_others(desk: Client) -> 
         assert desk.ok("GET", "/api/state")["project"] is None
 
 
+@pytest.mark.slow
 def test_events_begin_with_the_state(desk: Client) -> None:
     connection = http.client.HTTPConnection(desk.host, timeout=30)
     connection.request("GET", "/api/events", headers={"Cookie": desk.cookie})

@@ -42,6 +42,7 @@ def test_tables_keep_their_form() -> None:
     assert CsvTable.parse(text).to_text() == text
 
 
+@pytest.mark.slow
 def test_lists_scenarios_and_shipped_ones(town: Client) -> None:
     start = town.ok("GET", "/api/start")
     assert [each["id"] for each in start["scenarios"]] == ["mini", "town"]
@@ -49,6 +50,7 @@ def test_lists_scenarios_and_shipped_ones(town: Client) -> None:
     assert {".osm", ".net.xml"} <= set(start["map_kinds"])
 
 
+@pytest.mark.slow
 def test_shows_poles_of_the_map_first(town: Client) -> None:
     project = town.project
     assert [(each["site"], each["kind"], each["exists"]) for each in project["sites"]] == [
@@ -58,6 +60,7 @@ def test_shows_poles_of_the_map_first(town: Client) -> None:
     assert project["sites_editable"] and not project["counts"][0]["reason"]
 
 
+@pytest.mark.slow
 def test_shows_the_map(town: Client) -> None:
     scene = town.ok("GET", "/api/map")
     assert scene["key"] == town.project["map_key"]
@@ -116,6 +119,7 @@ def test_refuses_impossible_positions(town: Client, tmp_path: Path, x_m: float, 
     assert town.project["undo"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("body", "field"),
     [
@@ -143,6 +147,7 @@ def test_refuses_wrong_values_and_changes_nothing(
     assert [read(tmp_path, name) for name in ("sites.csv", "scenario.toml")] == before
 
 
+@pytest.mark.slow
 def test_unknown_poles_are_refused(town: Client) -> None:
     assert town.refused("PATCH", "/api/sites/nobody", {"z_m": 4})[0] == 404
     assert town.refused("DELETE", "/api/sites/nobody")[0] == 404
@@ -373,6 +378,7 @@ def test_archives_of_others_are_checked(desk: Client, tmp_path: Path) -> None:
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_a_scenario_that_is_a_link_is_not_opened(desk: Client, tmp_path: Path) -> None:
     path = tmp_path / "work" / "mini" / "scenario.toml"
     path.rename(tmp_path / "elsewhere.toml")

@@ -170,6 +170,7 @@ def test_sensor_that_looks_at_the_lane_is_chosen(designed: tuple[Path, DesignRes
     assert result.start is result.designed is None
 
 
+@pytest.mark.slow
 def test_command_writes_a_sensor_that_a_scenario_can_use(tmp_path: Path, monkeypatch: Any, run_egvs: Any) -> None:
     path = one_lane(tmp_path)
     monkeypatch.chdir(tmp_path)

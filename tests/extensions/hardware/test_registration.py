@@ -29,6 +29,7 @@ def errors(pose: Pose, truth: Pose) -> np.ndarray:
     return np.array([getattr(pose, name) - getattr(truth, name) for name in PARAMETERS])
 
 
+@pytest.mark.slow
 def test_recovers_known_pose() -> None:
     fit = register_scan(yard_scan(CATALOGUE["VLP-16"]), StaticSurfaces(yard(), YARD_POSE.position_m), START)
     assert fit.converged and fit.not_fixed == ()

@@ -116,6 +116,7 @@ def test_shows_sensor_design(run: tuple[Scenario, Path]) -> None:
     assert section_text(render_report(scenario.model_copy(update={"score": other}), out), "sensor-design") is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", [file.name for file in FILES])
 def test_results_of_other_traffic_are_not_shown(run: tuple[Scenario, Path], file: str) -> None:
     """The page is the same, byte for byte, as without the file."""

@@ -75,6 +75,7 @@ def test_long_straight_lanes_follow_the_relief(tmp_path: Path) -> None:
     assert lanes["ad_0"][:, 1] == pytest.approx(np.full(len(lanes["ad_0"]), lanes["ad_0"][0, 1]), abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_sumo_drives_on_it(tmp_path: Path) -> None:
     """SUMO writes z and slope of the draped lane: at 4 %, 2.29 degrees."""

@@ -219,6 +219,7 @@ def gate_pairs(network: Network) -> list[tuple[str, str]]:
 # ---- a small map
 
 
+@pytest.mark.slow
 def test_crossing_becomes_eight_roads_and_twelve_turns(tmp_path: Path) -> None:
     crossing = make_crossing(tags={"speed_limit": "36"})
     built = build(crossing.writer.write(tmp_path / "map.osm", turn_lines=1))
@@ -233,6 +234,7 @@ def test_crossing_becomes_eight_roads_and_twelve_turns(tmp_path: Path) -> None:
     assert not built.roads.has_heights
 
 
+@pytest.mark.slow
 def test_turns_have_the_directions_of_the_map(tmp_path: Path) -> None:
     crossing = make_crossing()
     built = build(crossing.writer.write(tmp_path / "map.osm"))
@@ -300,6 +302,7 @@ def test_preserves_heights_and_makes_no_junctions_of_bridges(tmp_path: Path) -> 
     assert [j for j in build(path).network.junctions if j.id.startswith("junction")]
 
 
+@pytest.mark.slow
 def test_position_on_the_earth_is_stated(tmp_path: Path) -> None:
     crossing = make_crossing()
     built = build(crossing.writer.write(tmp_path / "map.osm"))

@@ -246,6 +246,7 @@ def test_header_offset_places_the_map(heading: float, tmp_path: Path) -> None:
     assert frame.from_crs(np.array([[x, y]]), "EPSG:32632")[0] == pytest.approx(middle, abs=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(("reference", "has_frame"), [
     (maps.UTM, True), (maps.UTM + " +geoidgrids=egm96_15.gtx +vunits=m", True), (WKT, True), ("EPSG:32632", True),

@@ -115,6 +115,7 @@ def test_mutants_of_relief(tmp_path: Path, count: int) -> None:
     assert rejected > count // 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_some_mutants(tmp_path: Path, suffix: str) -> None:
     read, rejected = read_mutants(tmp_path, suffix, 25)

@@ -311,6 +311,7 @@ def test_own_table_gives_the_same_tpog(mini: Path, run_egvs, tmp_path: Path) -> 
     np.testing.assert_array_equal(*counts)
 
 
+@pytest.mark.slow
 def test_long_gap_is_unknown_and_not_empty(mini: Path, run_egvs, tmp_path: Path) -> None:
     """Without the rows of one car between 6 and 10 s (frames 12 to 20), voxels on its way there are scaled."""
     rows = [row for row in boxes_of_fcd() if not (row[0] == "east" and 6.0 <= row[1] <= 10.0)]
@@ -388,6 +389,7 @@ def test_wrong_pedestrian_tracks_are_reported(mini: Path, run_egvs, tmp_path: Pa
     assert message in err
 
 
+@pytest.mark.slow
 def test_recorded_and_simulated_pedestrians_exclude_each_other(mini: Path, run_egvs, tmp_path: Path) -> None:
     simulated(mini, walkers(41))
     options = ("--set", "effects.pedestrians_bicycles.pedestrians_per_h=10")

@@ -128,6 +128,7 @@ def test_rejects_folder_without_plan(run_egvs, mini, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_rejects_options_and_detectors_of_single_sites(run_egvs, planned, monkeypatch, tmp_path):
     mini, out = planned
     for option in (["--keep"], ["--detections", tmp_path]):

@@ -50,6 +50,7 @@ def test_one_row_per_site_score_and_parameters(computed):
     assert all(row.seconds >= 0 and math.isfinite(row.value) for row in scores.rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "parameters"),
     [

@@ -64,6 +64,7 @@ def test_list_in_order_of_time_gives_direction() -> None:
     assert fit_beam_angles([Sweep("list", points[::-1])])[0].direction == -1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_list", [False, True])
 def test_field_of_view(is_list: bool) -> None:
     """Only returns tell its ends in a list: with losses and a wall of limited height, to a few steps."""

@@ -61,6 +61,7 @@ def test_intervals_contain_the_true_values() -> None:
         assert np.mean(hits[what]) >= 0.91
 
 
+@pytest.mark.slow
 def test_beams_off_the_axis() -> None:
     """A twin of an Ouster on a gantry: all beams, both offsets, and the height over the ground."""
     points, channel = ouster_sweep()

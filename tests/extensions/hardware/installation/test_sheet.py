@@ -69,6 +69,7 @@ def test_true_bearing_points_to_where_the_front_points(located: Path) -> None:
     assert data.crs.startswith("EPSG:25832 (ETRS89 / UTM zone 32N")
 
 
+@pytest.mark.slow
 def test_grid_bearing_and_angles_are_those_of_the_pose(installed: InstalledRun) -> None:
     data = sheet.sheet_data(installed.sites, "pole_a")
     assert data.grid_bearing_deg == 150.0  # yaw -60: from the x axis towards south
@@ -79,6 +80,7 @@ def test_grid_bearing_and_angles_are_those_of_the_pose(installed: InstalledRun) 
     assert data.rank.endswith("of 2 sites")
 
 
+@pytest.mark.slow
 def test_sensor_that_is_upside_down_is_described_as_it_hangs(installed: InstalledRun) -> None:
     """Its field of view is that in the world: the beams of the sensor that point up point down."""
     data = sheet.sheet_data(installed.sites, "pole_a")

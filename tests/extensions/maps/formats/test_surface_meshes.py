@@ -45,6 +45,7 @@ def test_corners_a_tenth_of_a_millimetre_apart_are_one() -> None:
     assert not triangulate_surfaces(apart).is_closed
 
 
+@pytest.mark.slow
 @given(
     normal=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: sum(c * c for c in v) > 0.01),
     corners=st.integers(3, 12),

@@ -42,6 +42,7 @@ def test_names_of_columns_and_coordinates_of_utm(tmp_path: Path) -> None:
     assert tracks.frame.crs == "EPSG:25832"
 
 
+@pytest.mark.slow
 def test_500_frames_written_and_read(tmp_path: Path) -> None:
     boxes = moving_boxes(["car", "truck", "bus", "motorcycle", "bicycle", "pedestrian", "other"])
     assert_same_boxes(lumpi.read(write_lumpi(tmp_path, boxes)), boxes)

@@ -219,6 +219,7 @@ def test_rejects_damaged_kml(tmp_path: Path, lanes: str, message: str) -> None:
         read_signals([tmp_path / "map.kml"])
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("states", "groups", "message"),
@@ -237,6 +238,7 @@ def test_rejects_signals_that_do_not_fit(tmp_path: Path, states: dict[str, str],
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_kml_needs_a_map_with_a_reference_system(tmp_path: Path) -> None:
     (tmp_path / "map.net.xml").write_text(NETWORK)

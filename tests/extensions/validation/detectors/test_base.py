@@ -26,6 +26,7 @@ def test_no_detections():
     assert len(suppress_overlaps(Detections.empty(), np.empty(0)).boxes) == 0
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1), st.integers(1, 25))
 def test_equals_comparison_with_all_others(seed, count):
     random = np.random.default_rng(seed)

@@ -117,6 +117,7 @@ def test_completes_car_hidden_by_pole():
     assert overlaps([car], blind.detect(sweep))[0].min() < 0.7 if len(blind.detect(sweep).boxes) else True
 
 
+@pytest.mark.slow
 def test_drops_pedestrian():
     detector, sweep = simulate_sweep([(8.0, 5.0, 0.6, 0.5, 1.75, 0.2)])
     assert len(detector.detect(sweep).boxes) == 0

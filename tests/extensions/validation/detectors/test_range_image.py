@@ -113,6 +113,7 @@ def test_features_by_hand():
     assert row["hidden_low_a"] == row["hidden_high_a"] == 0.0  # nothing hides it
 
 
+@pytest.mark.slow
 def test_hidden_end_of_a_wall():
     view = view_of(Pose(0.0, 0.0, 3.0))
     wall, post = np.array([12.05, 0.0, 1.0, 0.1, 6.0, 2.0, 0.0]), np.array([6.0, 1.0, 1.5, 0.4, 0.8, 3.0, 0.0])
@@ -127,6 +128,7 @@ def test_hidden_end_of_a_wall():
 # ---- any sweep
 
 
+@pytest.mark.slow
 def test_no_points_and_few_points_give_nothing():
     view = view_of(Pose(0.0, 0.0, 5.0))
     site = RangeImage().at_site(view, ROI)
