@@ -40,6 +40,7 @@ def test_comparison_names_its_runs_and_their_agreement(mini: Path, tmp_path: Pat
     )
 
 
+@pytest.mark.slow
 def test_rated_pose_shows_the_recommended_score_or_the_reason(mini: Path, tmp_path: Path) -> None:
     scenario = egvs.load(mini, ["score.rank_by='expected_detections'"])
     egvs.run(scenario, tmp_path / "run")

@@ -891,6 +891,7 @@ def test_rejects_measurements_that_would_spend_held_out_junctions(
     assert not (tmp_path / "study").exists()
 
 
+@pytest.mark.slow
 def test_held_out_junctions_need_what_is_tested_to_be_frozen(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="are not frozen yet"):
         check_frozen(tmp_path)

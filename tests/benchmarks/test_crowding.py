@@ -40,6 +40,7 @@ def test_a_queue_ahead_by_hand():
     assert point_spacing_m(visible) == pytest.approx([math.sqrt(area / visible.points_alone[0])])
 
 
+@pytest.mark.slow
 def test_adjacent_lanes_by_hand():
     # sides at y = 1 and 2.2 from x = 20 to 24, seen from the origin: the near corner of the upper car is at (24, 2.2),
     # the far one of the lower car at (20, 1)

@@ -104,6 +104,7 @@ def test_no_fact_is_lost_in_the_report_and_with_verbose(six_poles: Path, tmp_pat
         assert [fact for fact in facts if " ".join(fact.replace("\u2019", "'").split()) not in plain] == []
 
 
+@pytest.mark.slow
 def test_a_pole_in_a_lane_is_named_whatever_else_is_warned_of(
     mini: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

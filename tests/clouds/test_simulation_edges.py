@@ -63,6 +63,7 @@ def test_range_of_a_beam_at_the_edge_of_a_plate(mini, gap_m, setting, range_m, i
     assert result[200] == (pytest.approx(range_m, abs=2e-3), pytest.approx(intensity, rel=1e-3))
 
 
+@pytest.mark.slow
 def test_share_of_mixed_points_along_an_edge_is_that_of_the_footprint(mini):
     """With 7 sub-beams a cone is as wide as its full angle: beams nearer to the edge than half of it are mixed.
 

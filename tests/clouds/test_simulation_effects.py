@@ -68,6 +68,7 @@ def test_dropout_of_all_returns(mini):
     assert len(simulator.sweep(frame_of([]), sweep_rng(1, "here", 0)).sweep.points) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [["effects.divergence.sub_beams=19"], ["effects.mount_sway.tilt_deg=1", "effects.mount_sway.samples=9"]],

@@ -99,6 +99,7 @@ def test_of_other_helper(): assert helper()
 """
 
 
+@pytest.mark.slow
 def test_portable_tests_are_those_that_use_a_module_of_the_platform(tmp_path: Path) -> None:
     path, with_setup = tmp_path / "test_some.py", tmp_path / "test_setup.py"
     path.write_text(SOME_TESTS)

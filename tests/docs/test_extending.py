@@ -166,6 +166,7 @@ def test_a_format_of_another_package_is_read(mini: Path, tmp_path: Path) -> None
     assert code == 2 and "expected 3 numbers per line, got 2" in text, text
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_a_format_of_another_package_is_written(tmp_path: Path) -> None:
     beside = install(package("A format of point clouds"), tmp_path / "installed")

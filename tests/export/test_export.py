@@ -78,6 +78,7 @@ def test_rejects_a_file_where_a_folder_is_needed(located: Path, tmp_path: Path, 
     assert "is a file. Give a folder: --to csv writes several files" in err
 
 
+@pytest.mark.slow
 def test_replaces_no_file_in_a_user_s_folder(local: Path, run_egvs: Call) -> None:
     """Of a scenario its sites, of a run its blind spots."""
     for to, folder, name in (("csv", local.parent / "mini", "sites.csv"), ("geoparquet", local, "blindspots.parquet")):

@@ -105,6 +105,7 @@ def test_pdf_contains_fonts(local: Path, tmp_path: Path) -> None:
     assert 0.3 < tall / wide < 2
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_png_has_a_size_on_paper(local: Path, tmp_path: Path) -> None:
     pytest.importorskip("cairosvg", reason="the extra egvs[figure] is not installed")

@@ -157,6 +157,7 @@ ROWS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_workbook(tmp_path: Path) -> None:
     path = tmp_path / "t.xlsx"
@@ -167,6 +168,7 @@ def test_workbook(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_open_document(tmp_path: Path) -> None:
     path = tmp_path / "t.ods"
@@ -194,6 +196,7 @@ def test_sheet_with_the_expected_header_is_read(tmp_path: Path) -> None:
         read_rows(path, check_header)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("content", [b"PK\x03\x04damaged", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1damaged"])
 def test_damaged_workbook(tmp_path: Path, content: bytes) -> None:
@@ -203,6 +206,7 @@ def test_damaged_workbook(tmp_path: Path, content: bytes) -> None:
         read(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "suffix", [pytest.param(suffix, marks=pytest.mark.system) for suffix in ("xlsx", "ods", "xls")] + ["csv"]
 )
@@ -237,6 +241,7 @@ def test_archive_of_other_files_is_no_damaged_workbook(tmp_path: Path) -> None:
         read(path)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_workbook_with_a_password_is_no_damaged_file(tmp_path: Path) -> None:
     path = tmp_path / "t.xlsx"
@@ -245,6 +250,7 @@ def test_workbook_with_a_password_is_no_damaged_file(tmp_path: Path) -> None:
         read(path)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("before", "after", "message"),
@@ -261,6 +267,7 @@ def test_rejects_cells_that_a_reader_cannot_see(tmp_path: Path, before: str, aft
     assert message in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("cell", "value"),
@@ -278,12 +285,14 @@ def test_formula_without_a_value_is_no_empty_cell(tmp_path: Path, cell: str, val
         )
 
 
+@pytest.mark.slow
 @pytest.mark.system
 def test_formula_may_give_an_empty_text(tmp_path: Path) -> None:
     path = _edited_workbook(tmp_path, "<c r='B2'><v>2</v></c>", "<c r='B2' t='str'><f>IF(A1>1,2,\"\")</f><v></v></c>")
     assert read(path)[0][1] == {"a": "1", "b": ""}
 
 
+@pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize(
     ("before", "after", "message"),

@@ -254,6 +254,7 @@ def test_half_turn_and_swapped_sides_give_same_voxels():
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("voxel_m", [0.1, 0.3, 1.0])
 def test_other_voxel_sizes(voxel_m):
     rng = np.random.default_rng(3)

@@ -123,6 +123,7 @@ def test_hard_segment(entry, backwards):
         )
 
 
+@pytest.mark.slow
 def test_reversed_hard_segments_cross_same_voxels():
     turned = 0
     for entry in SOUND:
@@ -342,6 +343,7 @@ def test_beams_in_the_world_frame(origin, start, beam, voxel_m):
         assert wrong <= set.union(*oracle.fragile(o, d, SHAPE, voxel_m, displaced_m(site, beam, origin)))
 
 
+@pytest.mark.slow
 @seldom
 @given(st.tuples(*[st.integers(-40, 400)] * 3), st.tuples(*[st.integers(-400, 400)] * 3))
 def test_same_voxels_400_km_from_origin(start, beam):
@@ -375,6 +377,7 @@ def test_corners_of_long_grid_from_1e7_m():
     assert excluded < 15
 
 
+@pytest.mark.slow
 def test_error_beyond_documented_range():
     """From 1e9 m away chords are good to 4 u R = 4.4e-7 m, not to 1e-8 m: the limit is real, and it is where it is said
     to be."""

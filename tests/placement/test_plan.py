@@ -439,6 +439,7 @@ def test_joint_score_in_python(five_candidates: Path, out: Path) -> None:
         joint.add("x")
 
 
+@pytest.mark.slow
 def test_says_that_one_sensor_is_enough(five_candidates: Path, out: Path, run_egvs) -> None:
     code, text, error = run_egvs("place", five_candidates, "--out", out, "--reach", 0.01)
     assert code == 0, error
@@ -496,6 +497,7 @@ def test_rejects_before_running(three_candidates: Path, tmp_path: Path, run_egvs
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_rejects_joint_score_of_zero(three_candidates: Path, tmp_path: Path, run_egvs) -> None:
     code, _, error = run_egvs(
         "place", three_candidates, "--out", tmp_path / "out", "--count", 2, "--set", "score.gamma=0"

@@ -58,6 +58,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     sys.modules.pop("plug_notes", None)
 
 
+@pytest.mark.slow
 def test_page_shows_the_section_and_its_warning(site: Path, tmp_path: Path) -> None:
     scenario, out = run_to_scores(tmp_path / "run")
     assert "notes" not in PageReader(render_report(scenario, out)).ids

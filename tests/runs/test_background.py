@@ -267,6 +267,7 @@ def test_error_of_traffic_is_raised_after_the_stages_before_it(
     assert contents(again).keys() == sequential.keys()  # what SUMO has read is there to look at
 
 
+@pytest.mark.slow
 def test_error_of_check_comes_before_an_earlier_one_of_traffic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sumo.sumo_version()
     fake_sumo(tmp_path, monkeypatch, "echo 'Error: it is broken' >&2; exit 1")

@@ -366,6 +366,7 @@ def test_a_store_that_cannot_be_written_is_named_once(
     assert run_egvs("store")[0] == (2 if place == "file" else 0)
 
 
+@pytest.mark.slow
 def test_invalid_store_settings_are_named(
     tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch, run_egvs
 ) -> None:

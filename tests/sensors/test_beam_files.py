@@ -250,6 +250,7 @@ def test_tables_are_read_as_offices_write_them(tmp_path: Path, content: bytes) -
     assert rings.elevations_deg == (15.5, -1.25) and rings.azimuth_offsets_deg == (-4.226, 1.39)
 
 
+@pytest.mark.slow
 @pytest.mark.system  # a workbook is read in a process of its own
 def test_workbook_of_rings(tmp_path: Path) -> None:
     pytest.importorskip("python_calamine")
@@ -378,6 +379,7 @@ def test_sensors_of_the_catalogue_have_usual_angles() -> None:
         assert describe_odd_angles(name, model.beam_table.elevation_deg, offsets_deg) is None, name
 
 
+@pytest.mark.slow
 def test_prints_what_is_read(tmp_path: Path, run_egvs: Any) -> None:
     metadata = write(tmp_path, "metadata.json", NESTED)
     table = write(tmp_path, "rings.csv", "elevation_deg,azimuth_deg\n1,2\n-3,4\n")

@@ -94,6 +94,7 @@ def plain_queue_m(vehicles: list[tuple[float, float]]) -> float:
     return length_m
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(st.integers(0, 3), st.floats(0, 200), st.just(2.0)),

@@ -73,6 +73,7 @@ def test_rejects_damaged_part(content: bytes, tmp_path: Path) -> None:
         list(tasks.read_part(tmp_path / "part.npz"))
 
 
+@pytest.mark.slow
 @given(st.integers(0, 5000), st.integers(1, 300))
 def test_splits_all_sites_evenly(count: int, number: int) -> None:
     parts = tasks.split_sites(count, number)

@@ -397,6 +397,7 @@ def test_lane_that_nothing_leads_to_can_be_reached(tmp_path: Path) -> None:
     assert lane.get("changeRight") is None
 
 
+@pytest.mark.slow
 def test_two_way_lanelet_becomes_two_roads(tmp_path: Path) -> None:
     writer = MapWriter()
     number = writer.lanelet(writer.line([[0, 3], [60, 3]]), writer.line([[0, 0], [60, 0]]), one_way="no")

@@ -76,6 +76,7 @@ def test_farthest_range_that_three_sweeps_share() -> None:
     assert [bool(mask[0]) for mask in not_shared(sweeps)] == [True] * 2 + [False] * 4 + [True] * 4
 
 
+@pytest.mark.slow
 def test_car_in_one_of_four_scans_is_removed() -> None:
     """The other three stations saw the ground where it was; a car that all saw stays, and so does a pole."""
     parked, passing = (8.0, -8.0, 0.75), (-6.0, 4.0, 0.75)

@@ -148,6 +148,7 @@ def test_counts_add_up(tmp_path: Path) -> None:
     assert [mesh.kind for mesh in result.meshes] == ["ground"]
 
 
+@pytest.mark.slow
 def test_gzipped_file_equals_plain_one(tmp_path: Path, survey: list[Path]) -> None:
     packed = tmp_path / "0.pcd.gz"
     packed.write_bytes(gzip.compress(survey[0].read_bytes(), mtime=0))

@@ -94,6 +94,7 @@ def test_origin_of_taf_bw_is_at_zero_with_true_scale(tmp_path: Path) -> None:
     assert north_m == pytest.approx(1e-4 * degree_m, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_500_frames_written_and_read(tmp_path: Path) -> None:
     boxes = moving_boxes(["car", "truck", "bus", "van", "motorcycle", "tram", "bicycle", "pedestrian"])
     assert_same_boxes(interaction.read(write_interaction(tmp_path, boxes)), boxes, ["z_m", "height_m"])

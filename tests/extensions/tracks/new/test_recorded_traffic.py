@@ -200,6 +200,7 @@ def test_errors_of_tracks_name_options(run_egvs, tmp_path: Path) -> None:
     assert unknown[0] == 2 and "in a TOML file, --track-columns FILE" in " ".join(unknown[2].split())
 
 
+@pytest.mark.slow
 def test_two_statements_of_the_system_are_an_error(run_egvs, tmp_path: Path) -> None:
     road_map, tracks = write_crossing(tmp_path / "map.osm"), write_tracks(tmp_path / "tracks.csv")
     columns = tmp_path / "columns.toml"

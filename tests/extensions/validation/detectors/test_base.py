@@ -1,6 +1,7 @@
 """Overlap suppression keeps the detection with the largest weight."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -148,6 +148,7 @@ def test_empty_scene_gives_no_detections():
     assert len(detector.detect(sweep).boxes) == 0
 
 
+@pytest.mark.slow
 def test_order_of_points_has_no_effect():
     boxes = [(12.0, 8.0, *CAR, 0.0), (17.3, 8.0, *CAR, 0.0), (-20.0, 3.0, *CAR, 1.0)]
     detector, sweep = simulate_sweep(boxes, noise_m=0.03)

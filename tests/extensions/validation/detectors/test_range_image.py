@@ -74,6 +74,7 @@ def test_margins_extend_the_box_away_from_the_points():
     np.testing.assert_allclose(boxes, [[12.0, 2.625, 0.75, 4.0, 1.75, 1.5, 0.0]])
 
 
+@pytest.mark.slow
 def test_shipped_model_finds_a_car():
     view = view_of(Pose(0.0, 0.0, 5.0))
     detections = base.make_detector("range_image").at_site(view, ROI).detect(sweep_of(view, [CAR]))
