@@ -164,6 +164,7 @@ class ReducedProgram(Program):
         with zipfile.ZipFile(built) as archive:
             archive.extractall(self.site)
         self.environment["PYTHONPATH"] = str(self.site)
+        self.environment["NUMBA_CACHE_DIR"] = str(copy.parent / "kernels")  # compiled once, not in each copy
         report("wheel built and unpacked")
 
     def check_modules(self, prefixes: Sequence[str]) -> None:
