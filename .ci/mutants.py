@@ -4,11 +4,12 @@ usage: python .ci/mutants.py [--sample N] [--seed S] [--jobs N] [--skip-explaine
 
 A mutant is one changed operator, number, condition or loop, made by Cosmic Ray. Without arguments all mutants of the
 formula modules are tried; otherwise those of modules or packages, such as `kernels/occupancy` or `scoring`. Each is
-tried on the tests of its module, then on the fast ones of its package, in a process that is forked once the tests are
-collected; there, its code replaces the module's. Short tests come first, since most mutants fail one. A mutant of a
-kernel is not compiled: that would take longer than the tests. A test that takes more than ten seconds without a mutant,
-or fails without compiled kernels, is left out. A mutant is killed if a test fails or hangs. The others survive; they
-are printed after each group of tests, and as they are found appended to `build/mutants/passing.txt`.
+tried on the tests of its module, then on those of its package, the fast ones first, in a process that is forked once
+the tests are collected; there, its code replaces the module's. Short tests come first, since most mutants fail one. A
+mutant of a kernel is not compiled: that would take longer than the tests. A test that takes more than ten seconds
+without a mutant, or fails without compiled kernels, is left out. A mutant is killed if a test fails or hangs. The
+others survive; they are printed after each group of tests, and as they are found appended to
+`build/mutants/passing.txt`.
 `.ci/equivalent_mutants.txt` says which mutants compute the same, and why. With `--skip-explained` these are not tried,
 nor any other mutant of the module that reads the same.
 """
@@ -247,7 +248,7 @@ def survivors(module: str, mutants: Sequence[Mutant], jobs: int) -> list[Mutant]
     unchanged = Mutant(module, _source(module), 0, "unchanged")
     alive = list(mutants)
     own, others = own_and_other_tests(module)
-    for marks, files in ((FAST, own), (SLOW, own), (FAST, others)):
+    for marks, files in ((FAST, own), (SLOW, own), (FAST, others), (SLOW, others)):
         if not alive or not files:
             continue
         options, usual_s = try_unchanged(module, ["-m", marks, *files])
