@@ -140,7 +140,7 @@ fuzz: $(VENV)/.installed-dev
 
 # Changes the code in one place at a time, and lists what no test notices. MUTANTS: options and modules
 mutants: $(VENV)/.installed-dev
-	$(INSTALL) --no-build-isolation --editable '.[mutants]'
+	$(INSTALL) --editable '.[mutants]'
 	$(BIN)/python .ci/mutants.py $(MUTANTS)
 
 schema: $(VENV)/.installed
