@@ -201,15 +201,15 @@ class _Trials(_Tests):
         signal.setitimer(signal.ITIMER_REAL, LONGEST_WAIT_S + longest_s)
 
 
-def run_tests(module: str, options: Sequence[str], plugin: _Tests) -> int:
-    """Run tests of a module in a process of its own, and return its exit code; kernels are tested uncompiled."""
+def run_tests(name: str, options: Sequence[str], plugin: _Tests) -> int:
+    """Run tests of a module or package in a process of its own, and return its exit code; kernels uncompiled."""
     if process := os.fork():
         _, status = os.waitpid(process, 0)
         return os.waitstatus_to_exitcode(status)
     null = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(null, stream)
-    if module.startswith("kernels/"):
+    if name.split("/")[0] == "kernels":
         numba.config.DISABLE_JIT = True
     ended = int(pytest.main([*PYTEST, *options], plugins=[plugin]))
     if not isinstance(plugin, _Trials):
@@ -217,17 +217,17 @@ def run_tests(module: str, options: Sequence[str], plugin: _Tests) -> int:
     os._exit(ended)
 
 
-def own_and_other_tests(module: str) -> list[list[str]]:
-    """Return the files of tests of a module; those of its package and of its users."""
-    package, name = module.rsplit("/", 1)
-    packages = (package, *USERS.get(module, ()))
+def groups_of_tests(name: str) -> list[list[str]]:
+    """Return the files of tests of a package; or those of a module, and the others of its package and of its users."""
+    package, _, module = name.partition("/")
+    packages = (package, *USERS.get(name, ()))
     files = [file for each in packages for file in sorted((ROOT / "tests" / each).rglob("test_*.py"))]
-    own = [file for file in files if file.stem.startswith(f"test_{name}")]
+    own = [file for file in files if file.stem.startswith(f"test_{module}")]
     parts = own, [file for file in files if file not in own]
-    return [[str(file.relative_to(ROOT)) for file in part] for part in parts]
+    return [[str(file.relative_to(ROOT)) for file in part] for part in parts if part]
 
 
-def try_unchanged(module: str, options: Sequence[str]) -> tuple[list[str], dict[str, float]]:
+def try_unchanged(name: str, options: Sequence[str]) -> tuple[list[str], dict[str, float]]:
     """Run tests without a mutant; return the options that leave out what fails or takes long, and seconds by test.
 
     They are run twice: a fixture of several tests takes its time in the first of them, and the order is set by time.
@@ -235,35 +235,34 @@ def try_unchanged(module: str, options: Sequence[str]) -> tuple[list[str], dict[
     usual_s: dict[str, float] = {}
     for _ in range(2):
         UNCHANGED.unlink(missing_ok=True)
-        code = run_tests(module, options, _Tests(usual_s))
+        code = run_tests(name, options, _Tests(usual_s))
         if code not in (*PASSED, pytest.ExitCode.TESTS_FAILED):
-            raise SystemExit(f"{module}: without a change the tests end with {code}")
+            raise SystemExit(f"{name}: without a change the tests end with {code}")
         usual_s, failed = json.loads(UNCHANGED.read_text(encoding="utf-8"))
-    long = [name for name, seconds in usual_s.items() if seconds > LONGEST_TEST_S]
-    return [*options, *(f"--deselect={name}" for name in {*failed, *long})], usual_s
+    long = [test for test, seconds in usual_s.items() if seconds > LONGEST_TEST_S]
+    return [*options, *(f"--deselect={test}" for test in {*failed, *long})], usual_s
 
 
-def survivors(module: str, mutants: Sequence[Mutant], jobs: int) -> list[Mutant]:
-    """Return the mutants of a module with which all tests pass."""
-    unchanged = Mutant(module, _source(module), 0, "unchanged")
+def survivors(name: str, mutants: Sequence[Mutant], jobs: int) -> list[Mutant]:
+    """Return the mutants of a module or package with which all tests pass."""
     alive = list(mutants)
-    own, others = own_and_other_tests(module)
-    for marks, files in ((FAST, own), (SLOW, own), (FAST, others), (SLOW, others)):
-        if not alive or not files:
-            continue
-        options, usual_s = try_unchanged(module, ["-m", marks, *files])
+    for files, marks in itertools.product(groups_of_tests(name), (FAST, SLOW)):
+        if not alive:
+            break
+        options, usual_s = try_unchanged(name, ["-m", marks, *files])
         left_out = sum(option.startswith("--deselect") for option in options)
-        print(f"  {module}, {marks}: {len(alive)} mutants, {len(usual_s)} tests, {left_out} left out", flush=True)
+        print(f"  {name}, {marks}: {len(alive)} mutants, {len(usual_s)} tests, {left_out} left out", flush=True)
+        unchanged = Mutant(alive[0].module, _source(alive[0].module), 0, "unchanged")
         tried = [unchanged, *alive]
         PASSING.write_text("", encoding="utf-8")
-        if code := run_tests(module, [*options, "-x"], _Trials(tried, usual_s, jobs)):
-            raise SystemExit(f"{module}: the trials end with {code}, before all mutants were tried")
+        if code := run_tests(name, [*options, "-x"], _Trials(tried, usual_s, jobs)):
+            raise SystemExit(f"{name}: the trials end with {code}, before all mutants were tried")
         passing = {int(line.split(" ")[0]) for line in PASSING.read_text(encoding="utf-8").splitlines()}
         if 0 not in passing:
-            raise SystemExit(f"{module}: a test fails without a change, so they tell nothing of changes")
+            raise SystemExit(f"{name}: a test fails without a change, so they tell nothing of changes")
         alive = [mutant for number, mutant in enumerate(tried) if number in passing and mutant is not unchanged]
         for mutant in alive:
-            print(f"    passes: {mutant.line}: {mutant.change}", flush=True)
+            print(f"    passes: {mutant.module}:{mutant.line}: {mutant.change}", flush=True)
     return alive
 
 
@@ -288,9 +287,7 @@ def main() -> int:
             random.Random(options.seed).shuffle(changes)
         mutants = list(itertools.islice(filter(None, itertools.starmap(make_mutant, changes)), options.sample))
         tried = [mutant for mutant in mutants if not options.skip_explained or str(mutant) not in explained]
-        alive = []
-        for module in dict.fromkeys(mutant.module for mutant in tried):
-            alive += survivors(module, [mutant for mutant in tried if mutant.module == module], options.jobs)
+        alive = survivors(name, tried, options.jobs)
         unknown = [mutant for mutant in alive if str(mutant) not in explained]
         unexplained += len(unknown)
         equivalent = len(mutants) - len(tried) + len(alive) - len(unknown)
