@@ -599,7 +599,7 @@ def warn_repeated_solids(inputs: CheckInputs) -> Iterator[Diagnostic]:
         names = list_first(repeated, MAX_NAMED_SOLIDS)
         verb = by_number(len(repeated), "has", "have")
         problem = f"{number_of(len(repeated), 'solid')} {verb} the shape and the position of another one: {names}"
-        yield Diagnostic("repeated solids", "statics", problem, "Maps may contain one twice: remove it, or the file listed twice.")
+        yield Diagnostic("repeated solids", "statics", problem, "Remove it from the map, or list each file once.")
 
 
 def warn_solids_far_away(inputs: CheckInputs) -> Iterator[Diagnostic]:
