@@ -60,7 +60,7 @@ def test_the_answer_has_twelve_lines(six_poles: Path, tmp_path: Path, run_egvs) 
     warnings = collect_warnings(stage.summary for stage in RunRecord.read(out).stages.values())
     assert len(warnings) > 1
     assert lines[0].startswith(f"{len(warnings)} warnings; the most serious: {by_severity(warnings)[0].where}")
-    assert "Assumed, not measured: traffic (guessed); positions of the poles and 2 more." in lines
+    assert "Assumed, not measured: traffic (guessed); positions of the poles; 2 more." in lines
     assert lines[-1].startswith(f"report: {out / 'report.html'} ")
     assert len(answer_lines(*run_egvs("run", six_poles, *settings, "--top", "6")[1:])) > len(lines)
 

@@ -131,7 +131,7 @@ def test_a_plan_takes_at_most_250_words(capsys: pytest.CaptureFixture[str]) -> N
     files = tuple(Path("runs/r", name) for name in ("placement.parquet", "curve.parquet", "report.html"))
     placed = replace(two, sensors=sensors, curve=steps, fused=fused, files=files)
     caveat = (
-        "Assumed, not measured: traffic (1,240 vehicles an hour in 12 movements); positions of the poles and 1 more."
+        "Assumed, not measured: traffic (1,240 vehicles an hour in 12 movements); positions of the poles; 1 more."
     )
     place.print_placement(placed, ["replaces the plan for --count 2"], [caveat], CLUSTER)
     assert len(capsys.readouterr().out.split()) <= 250

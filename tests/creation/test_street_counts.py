@@ -255,7 +255,7 @@ def test_counts_of_one_hour_are_no_period(tmp_path: Path, run_egvs: Any) -> None
     assert (traffic.periods, [count.per_hour for count in traffic.counts]) == ((), [3880.0])
     assert main_assumptions(scenario.assumed) == (
         "Assumed, not measured: no vehicles in uncounted movements: North Street (north) right and others;"
-        " positions of the poles and 4 more."
+        " positions of the poles; 4 more."
     )
     text = (tmp_path / "new" / "scenario.toml").read_text()
     assert "North Street (north), left to East Street" in text

@@ -38,7 +38,8 @@ def print_new_scenario(scenario: NewScenario, map_notes: Sequence[str] = ()) -> 
         out.print(f"warning: {warning}")
     if scenario.attributions:
         out.print(f"Map data {'; '.join(scenario.attributions)}")
-    out.print(f"edit: {_tables_to_edit(scenario)}; {SCENARIO_FILE} (existing_poles, costs)")
+    check = shlex.join(["egvs", "check", str(scenario.folder)])
+    out.print(f"edit: {_tables_to_edit(scenario)}; {SCENARIO_FILE} (existing_poles, costs); then {check}")
     out.print(f"next: {shlex.join(['egvs', 'run', str(scenario.folder)])}")
     out.print(f"      {shlex.join(['egvs', 'place', str(scenario.folder), '--count', '2'])}   (or --budget)")
 

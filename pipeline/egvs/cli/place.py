@@ -103,7 +103,8 @@ def place(
     caveats = [sections.describe_missing_traffic(collect_warnings([traffic])), sections.main_assumptions(assumed)]
     if placed.fused is not None and placed.fused.noticed is not None:
         caveats.append(sensor_text.upper_limit_note(loaded, [sensor.sensor for sensor in placed.sensors]))
-    caveats.append(_describe_unplaced_sensors(loaded, {site.sensor for site in sites.candidate_sites(loaded)}))
+    candidates, planned = {site.sensor for site in sites.candidate_sites(loaded)}, {s.sensor for s in placed.sensors}
+    caveats += [_describe_unplaced_sensors(loaded, candidates), _describe_unchosen_sensors(candidates, planned)]
     found, has_relief = _plan_level(loaded, folder, placed), sites.has_relief(loaded)
     print_placement(placed, notes, [caveat for caveat in caveats if caveat], found, has_relief=has_relief)
 
@@ -116,6 +117,17 @@ def _describe_unplaced_sensors(scenario: Scenario, placeable: Collection[str]) -
     from egvs.results.labels import join_names
 
     return f"No plan has {join_names(unplaced)}: add {by_number(len(unplaced), 'it', 'them')} to sites.sensor."
+
+
+def _describe_unchosen_sensors(candidates: Collection[str], planned: Collection[str]) -> str:
+    """Return which sensors are at candidate sites only; empty if none, or where nothing is planned."""
+    unchosen = sorted(set(candidates) - set(planned))
+    if not unchosen or not planned:
+        return ""
+    from egvs.results.labels import join_names
+
+    were = by_number(len(unchosen), "was a candidate", "were candidates")
+    return f"{join_names(unchosen)} {were}, too: no better plan has {by_number(len(unchosen), 'it', 'them')}."
 
 
 def _plan_level(scenario: Scenario, folder: Path, placed: SensorPlan) -> DetectionLevel:

@@ -314,9 +314,9 @@ class PlanRules:
         return allowed
 
     def what_forbids_more(self, plan: Sequence[int]) -> str:
-        """Return the rules that forbid every other candidate beside a plan, whatever the count and the budget are.
+        """Return what forbids every other candidate beside a plan: the rules, and the budget if it does, too.
 
-        Empty if one may be added, or there is no other.
+        Empty if a larger count and budget would allow one, or there is no other.
         """
         unlimited = replace(self, count=len(self.cost) + 1, budget=np.inf)
         without_rules = replace(unlimited, most_per_pole=len(self.cost), least_distance_m=0.0)
@@ -329,7 +329,10 @@ class PlanRules:
             distance: replace(unlimited, most_per_pole=len(self.cost)),
         }
         free = without_rules.allowed_additions(plan)
-        return " and ".join(name for name, alone in rules.items() if (free & ~alone.allowed_additions(plan)).any())
+        names = [name for name, alone in rules.items() if (free & ~alone.allowed_additions(plan)).any()]
+        if not replace(without_rules, budget=self.budget).allowed_additions(plan).any():
+            names.append("the budget")
+        return " and ".join(names)
 
     def allows(self, plan: Sequence[int]) -> bool:
         """Whether a plan, in any order, keeps the rules and contains the forced candidates."""

@@ -13,7 +13,6 @@ from typing import Any
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import Diagnostic
-from egvs.core.wording import list_first
 from egvs.results.labels import join_names
 from egvs.results.ranking import Pole
 from egvs.scenario.model import NO_SURROUNDINGS, POLE_POSITIONS, Scenario
@@ -103,11 +102,12 @@ def main_assumptions(assumed: Sequence[str]) -> str:
     if not assumed:
         return ""
     entries = sorted(assumed, key=order)
-    named = list_first(entries, _NAMED_ASSUMPTIONS, "; ")
+    named = "; ".join(entries[:_NAMED_ASSUMPTIONS])
     if len(named) > _LONG:
-        without_lists = [re.sub(r"(: [^,]+), .*", r"\1 and others", entry) for entry in entries]
-        named = re.sub(rf" \((?!{'|'.join(COMPASS)})[^)]*\)", "", list_first(without_lists, _NAMED_ASSUMPTIONS, "; "))
-    return f"Assumed, not measured: {named}."
+        without_lists = [re.sub(r"(: [^,]+), .*", r"\1 and others", entry) for entry in entries[:_NAMED_ASSUMPTIONS]]
+        named = re.sub(rf" \((?!{'|'.join(COMPASS)})[^)]*\)", "", "; ".join(without_lists))
+    more = f"; {len(entries) - _NAMED_ASSUMPTIONS} more" if len(entries) > _NAMED_ASSUMPTIONS else ""
+    return f"Assumed, not measured: {named}{more}."
 
 
 def describe_missing_traffic(warnings: Iterable[Diagnostic]) -> str:
