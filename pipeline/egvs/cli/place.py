@@ -274,8 +274,8 @@ def _sensor_table(placed: SensorPlan, width: int) -> Table:
         Column(head("pitch deg"), lambda row: f"{row.pitch_deg:z.1f}"),
         Column("sensor", lambda row: row.sensor, "left"),
         *rolls,
-        Column(head("adds", by.change_head), lambda row: by.change(row.gain, row.gain_se)),
-        Column(head(_together_head(by)), lambda row: by.with_error(row.score, row.score_se)),
+        Column(head("adds", by.change_head), lambda row: _format_gain(by, row)),
+        Column(head(_together_head(by)), lambda row: _format_together(by, row)),
         Column(head("lost if it fails", by.change_head), lambda row: by.change(row.loss)),
     ]
     if any(step.cost for step in placed.curve):
@@ -286,13 +286,25 @@ def _sensor_table(placed: SensorPlan, width: int) -> Table:
     return make_table(columns, placed.sensors)
 
 
+def _format_gain(by: ScoreLabel, row: PlannedSensor) -> str:
+    """Return what a sensor adds, with its error; the first one adds what it finds."""
+    return _format_together(by, row) if row.gain == row.score else by.change(row.gain, row.gain_se)
+
+
+def _format_together(by: ScoreLabel, row: PlannedSensor | PlanStep) -> str:
+    """Return the score of a plan with its error; that of a share of vehicles found is in the first sentence."""
+    from egvs.scenario.score_config import DEFAULT_SCORE
+
+    return by.value(row.score) if by.name == DEFAULT_SCORE else by.with_error(row.score, row.score_se)
+
+
 def _curve_table(placed: SensorPlan, steps: Sequence[PlanStep], width: int) -> Table:
     from egvs.cli.console import Column, make_table
 
     by, head = placed.by, partial(_head, width)
     columns: list[Column[PlanStep]] = [
         Column("sensors", lambda step: str(step.count)),
-        Column(head(_together_head(by)), lambda step: by.with_error(step.score, step.score_se)),
+        Column(head(_together_head(by)), lambda step: _format_together(by, step)),
         Column("proved", lambda step: _format_rounded_down(step.certificate)),
     ]
     if any(step.cost for step in placed.curve):
@@ -393,14 +405,12 @@ def outdated_handovers(folder: Path, earlier: Sequence[tuple[Any, ...]], placed:
 
 
 def describe_errors(placed: SensorPlan) -> str:
-    """Return what follows "±", or why there are no standard errors."""
+    """Return what follows "±", or why there are no standard errors; that of a share found is mostly of its level."""
     from egvs.scenario.score_config import DEFAULT_SCORE
 
     if placed.has_errors:
-        text = f"± is one standard error, from {placed.errors_from}"
-        if placed.by.name == DEFAULT_SCORE:
-            text += ", without the level error"
-        return text
+        subject = "Every other ±" if placed.by.name == DEFAULT_SCORE else "±"
+        return f"{subject} is one standard error, from {placed.errors_from}"
     return f"no standard errors: {placed.errors_from}"
 
 

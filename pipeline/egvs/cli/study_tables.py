@@ -43,7 +43,7 @@ from egvs.results.sensors import (
     SensorResult,
     format_difference,
 )
-from egvs.scenario.score_config import NOTICED
+from egvs.scenario.score_config import DEFAULT_SCORE, NOTICED
 from egvs.scenario.settings import effect_state
 
 if TYPE_CHECKING:
@@ -213,7 +213,13 @@ def _describe_mount(with_pitch: bool, site: RankedSite) -> str:
 
 
 def format_score(site: RankedSite) -> str:
-    """Return the score that ranks with its standard error, e.g. "87.1 ± 0.5 %"; that of other scores is relative."""
+    """Return the score that ranks with its standard error, relative for scores that are no shares.
+
+    A share of vehicles found has none here: its error is mostly that of the level, which all sites share; the errors of
+    differences are in a column of their own.
+    """
+    if site.by.name == DEFAULT_SCORE:
+        return site.by.value(site.score)
     if site.by.is_share:
         return site.by.with_error(site.score, math.nan if site.score_se is None else site.score_se)
     error = site.by.error(site.score, site.score_se)
