@@ -5,11 +5,11 @@ usage: python .ci/mutants.py [--sample N] [--seed S] [--jobs N] [--skip-explaine
 A mutant is one changed operator, number, condition or loop, made by Cosmic Ray. Without arguments all mutants of the
 formula modules are tried; otherwise those of modules or packages, such as `kernels/occupancy` or `scoring`. Each is
 tried on the tests of its module, then on those of its package, the fast ones first, in a process that is forked once
-the tests are collected; there, its code replaces the module's. Short tests come first, since most mutants fail one. A
-mutant of a kernel is not compiled: that would take longer than the tests. A test that takes more than ten seconds
-without a mutant, or fails without compiled kernels, is left out. A mutant is killed if a test fails or hangs. The
-others survive; they are printed after each group of tests, and as they are found appended to
-`build/mutants/passing.txt`.
+the tests are collected; there, its code replaces the module's. Only files with a test that calls the changed function
+are run, and short tests come first, since most mutants fail one. A mutant of a kernel is not compiled: that would take
+longer than the tests. A test that takes more than ten seconds without a mutant, or fails without compiled kernels, is
+left out. A mutant is killed if a test fails or hangs. The others survive; they are printed after each group of tests,
+and as they are found appended to `build/mutants/passing.txt`.
 `.ci/equivalent_mutants.txt` says which mutants compute the same, and why. With `--skip-explained` these are not tried,
 nor any other mutant of the module that reads the same.
 """
@@ -25,11 +25,13 @@ import os
 import random
 import signal
 import sys
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
+from types import FrameType
 
 import numba
 import pytest
@@ -64,8 +66,10 @@ FAST, SLOW = "not slow and not nightly", "slow and not nightly"
 PASSED = (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
 LONGEST_TEST_S = 10.0
 SLOWER = 5.0
-LEAST_LIMIT_S = 2.0
-"""A test with a mutant may take this and five times its usual processor time; else it hangs: the mutant is killed."""
+LEAST_LIMIT_S = 10.0
+"""A test with a mutant may take this and five times its usual processor time; else it hangs: the mutant is killed.
+
+It includes fixtures of several tests, which another test made before."""
 LONGEST_WAIT_S = 60.0
 """A test may take this and five times its usual processor time by the clock, too: it may wait for another process."""
 
@@ -77,6 +81,9 @@ class Mutant:
     module: str
     code: str
     line: int
+    function: range
+    """Lines of the function or method with the change; all lines for other code of the module."""
+
     change: str
     """The changed line before and after, without indentation; it names the mutant whatever its number of line."""
 
@@ -106,7 +113,17 @@ def make_mutant(module: str, name: str, occurrence: int) -> Mutant | None:
         return None
     pairs = zip(source.splitlines(), code.splitlines(), strict=False)
     line, (before, after) = next((n, pair) for n, pair in enumerate(pairs, start=1) if pair[0] != pair[1])
-    return Mutant(module, code, line, f"{before.strip()} -> {after.strip()}")
+    function = next((lines for lines in _functions(module) if line in lines), range(sys.maxsize))
+    return Mutant(module, code, line, function, f"{before.strip()} -> {after.strip()}")
+
+
+@cache
+def _functions(module: str) -> list[range]:
+    """Return the lines of each function of a module, and of each method of its classes, with their decorators."""
+    body = ast.parse(_source(module)).body
+    parts = [*body, *(part for each in body if isinstance(each, ast.ClassDef) for part in each.body)]
+    functions = [part for part in parts if isinstance(part, ast.FunctionDef)]
+    return [range(min(n.lineno for n in [f, *f.decorator_list]), (f.end_lineno or 0) + 1) for f in functions]
 
 
 @cache
@@ -138,21 +155,30 @@ def replace_code(module: str, code: str) -> None:
 
 
 class _Tests:
-    """A plugin of pytest: short tests first; how long each takes and which fail."""
+    """A plugin of pytest: how long tests take, which fail, and what each file of tests calls.
 
-    def __init__(self, usual_s: Mapping[str, float]) -> None:
+    :attr:`calls` has the lines at which functions begin that a file of tests calls, by file of the program.
+    """
+
+    def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self.failed: set[str] = set()
-        self._usual_s = usual_s
+        self.calls: dict[str, dict[str, set[int]]] = {}
+        self._file = ""
 
-    @pytest.hookimpl(trylast=True)
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        items.sort(key=lambda item: self._usual_s.get(item.nodeid, 0.0))
+    def _trace(self, frame: FrameType, event: str, _: object) -> None:
+        code = frame.f_code
+        if event == "call" and code.co_filename.startswith(str(SOURCE)):
+            self.calls.setdefault(self._file, {}).setdefault(code.co_filename, set()).add(code.co_firstlineno)
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         self.seconds[nodeid] = -_processor_s()
+        self._file = _file_of(nodeid)
+        threading.settrace(self._trace)  # of threads that the test starts
+        sys.settrace(self._trace)
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
+        sys.settrace(None)
         self.seconds[nodeid] += _processor_s()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
@@ -160,28 +186,46 @@ class _Tests:
             self.failed.add(report.nodeid)
 
 
+def _file_of(nodeid: str) -> str:
+    return nodeid.partition("::")[0]
+
+
 def _processor_s() -> float:
     """Return the processor time of this process and of those that it waited for."""
     return sum(os.times()[:4])
 
 
-class _Trials(_Tests):
-    """Forks a process for each mutant once the tests are collected; that process runs them until one fails or hangs."""
+class _Trials:
+    """A plugin of pytest: forks a process for each mutant, which runs tests until one fails or hangs.
 
-    def __init__(self, mutants: Sequence[Mutant], usual_s: Mapping[str, float], jobs: int) -> None:
-        super().__init__(usual_s)
+    Only files with a test that calls the changed function are run, short tests first.
+    """
+
+    def __init__(self, mutants: Sequence[Mutant], unchanged: Unchanged, jobs: int) -> None:
         self._mutants = mutants
+        self._seconds = unchanged.seconds
+        self._calls = unchanged.calls
         self._jobs = jobs
 
+    def _concerns(self, item: pytest.Item, mutant: Mutant) -> bool:
+        called = self._calls.get(_file_of(item.nodeid), {}).get(str(SOURCE / f"{mutant.module}.py"), ())
+        return any(line in mutant.function for line in called)
+
     @pytest.hookimpl(trylast=True)
-    def pytest_collection_finish(self) -> None:
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items.sort(key=lambda item: self._seconds.get(item.nodeid, 0.0))
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_finish(self, session: pytest.Session) -> None:
         waiting, running = list(range(len(self._mutants)))[::-1], {}
         while waiting or running:
             if waiting and len(running) < self._jobs:
                 number = waiting.pop()
                 if not (process := os.fork()):
                     os.setsid()
-                    replace_code(self._mutants[number].module, self._mutants[number].code)
+                    mutant = self._mutants[number]
+                    replace_code(mutant.module, mutant.code)
+                    session.items = [item for item in session.items if self._concerns(item, mutant)]
                     return
                 running[process] = number
                 continue
@@ -195,13 +239,12 @@ class _Trials(_Tests):
         os._exit(0)
 
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        super().pytest_runtest_logstart(nodeid)
-        longest_s = SLOWER * self._usual_s[nodeid]
+        longest_s = SLOWER * self._seconds[nodeid]
         signal.setitimer(signal.ITIMER_PROF, LEAST_LIMIT_S + longest_s)
         signal.setitimer(signal.ITIMER_REAL, LONGEST_WAIT_S + longest_s)
 
 
-def run_tests(name: str, options: Sequence[str], plugin: _Tests) -> int:
+def run_tests(name: str, options: Sequence[str], plugin: _Tests | _Trials) -> int:
     """Run tests of a module or package in a process of its own, and return its exit code; kernels uncompiled."""
     if process := os.fork():
         _, status = os.waitpid(process, 0)
@@ -212,8 +255,9 @@ def run_tests(name: str, options: Sequence[str], plugin: _Tests) -> int:
     if name.split("/")[0] == "kernels":
         numba.config.DISABLE_JIT = True
     ended = int(pytest.main([*PYTEST, *options], plugins=[plugin]))
-    if not isinstance(plugin, _Trials):
-        UNCHANGED.write_text(json.dumps([plugin.seconds, sorted(plugin.failed)]), encoding="utf-8")
+    if isinstance(plugin, _Tests):
+        calls = {file: {k: sorted(v) for k, v in called.items()} for file, called in plugin.calls.items()}
+        UNCHANGED.write_text(json.dumps([plugin.seconds, sorted(plugin.failed), calls]), encoding="utf-8")
     os._exit(ended)
 
 
@@ -227,20 +271,24 @@ def groups_of_tests(name: str) -> list[list[str]]:
     return [[str(file.relative_to(ROOT)) for file in part] for part in parts if part]
 
 
-def try_unchanged(name: str, options: Sequence[str]) -> tuple[list[str], dict[str, float]]:
-    """Run tests without a mutant; return the options that leave out what fails or takes long, and seconds by test.
+@dataclass(frozen=True)
+class Unchanged:
+    """Tests without a mutant: options that leave out what fails or takes long, seconds by test, and what they call."""
 
-    They are run twice: a fixture of several tests takes its time in the first of them, and the order is set by time.
-    """
-    usual_s: dict[str, float] = {}
-    for _ in range(2):
-        UNCHANGED.unlink(missing_ok=True)
-        code = run_tests(name, options, _Tests(usual_s))
-        if code not in (*PASSED, pytest.ExitCode.TESTS_FAILED):
-            raise SystemExit(f"{name}: without a change the tests end with {code}")
-        usual_s, failed = json.loads(UNCHANGED.read_text(encoding="utf-8"))
-    long = [test for test, seconds in usual_s.items() if seconds > LONGEST_TEST_S]
-    return [*options, *(f"--deselect={test}" for test in {*failed, *long})], usual_s
+    options: list[str]
+    seconds: dict[str, float]
+    calls: dict[str, dict[str, list[int]]]
+
+
+def try_unchanged(name: str, options: Sequence[str]) -> Unchanged:
+    """Run tests without a mutant."""
+    UNCHANGED.unlink(missing_ok=True)
+    code = run_tests(name, options, _Tests())
+    if code not in (*PASSED, pytest.ExitCode.TESTS_FAILED):
+        raise SystemExit(f"{name}: without a change the tests end with {code}")
+    seconds, failed, calls = json.loads(UNCHANGED.read_text(encoding="utf-8"))
+    long = [test for test, each_s in seconds.items() if each_s > LONGEST_TEST_S]
+    return Unchanged([*options, *(f"--deselect={test}" for test in {*failed, *long})], seconds, calls)
 
 
 def survivors(name: str, mutants: Sequence[Mutant], jobs: int) -> list[Mutant]:
@@ -249,13 +297,13 @@ def survivors(name: str, mutants: Sequence[Mutant], jobs: int) -> list[Mutant]:
     for files, marks in itertools.product(groups_of_tests(name), (FAST, SLOW)):
         if not alive:
             break
-        options, usual_s = try_unchanged(name, ["-m", marks, *files])
-        left_out = sum(option.startswith("--deselect") for option in options)
-        print(f"  {name}, {marks}: {len(alive)} mutants, {len(usual_s)} tests, {left_out} left out", flush=True)
-        unchanged = Mutant(alive[0].module, _source(alive[0].module), 0, "unchanged")
+        tests = try_unchanged(name, ["-m", marks, *files])
+        left_out = sum(option.startswith("--deselect") for option in tests.options)
+        print(f"  {name}, {marks}: {len(alive)} mutants, {len(tests.seconds)} tests, {left_out} left out", flush=True)
+        unchanged = Mutant(alive[0].module, _source(alive[0].module), 0, range(sys.maxsize), "unchanged")
         tried = [unchanged, *alive]
         PASSING.write_text("", encoding="utf-8")
-        if code := run_tests(name, [*options, "-x"], _Trials(tried, usual_s, jobs)):
+        if code := run_tests(name, [*tests.options, "-x"], _Trials(tried, tests, jobs)):
             raise SystemExit(f"{name}: the trials end with {code}, before all mutants were tried")
         passing = {int(line.split(" ")[0]) for line in PASSING.read_text(encoding="utf-8").splitlines()}
         if 0 not in passing:
