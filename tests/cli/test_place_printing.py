@@ -272,3 +272,8 @@ def test_sensor_with_a_price_and_no_site_is_named(mini: Path, run_egvs: Any) -> 
     scenario.write_text(scenario.read_text().replace('sensor = "small"', 'sensor = ["small", "OS1-64"]'))
     code, text, _ = run_egvs(*request)
     assert code == 0 and "No plan has" not in text
+    one_each = ("--budget", "30000", "--set", "placement.most_per_pole=1")
+    code, text, _ = run_egvs("place", mini, "--out", mini / "out", *one_each)
+    assert code == 0 and "small was a candidate, too: no better plan has it." in text
+    rules = "The limit of 1 sensor per pole (most_per_pole) and the budget forbid a third sensor beside them."
+    assert rules in " ".join(text.split())
