@@ -287,8 +287,11 @@ def _sensor_table(placed: SensorPlan, width: int) -> Table:
 
 
 def _format_gain(by: ScoreLabel, row: PlannedSensor) -> str:
-    """Return what a sensor adds, with its error; the first one adds what it finds."""
-    return _format_together(by, row) if row.gain == row.score else by.change(row.gain, row.gain_se)
+    """Return what a sensor adds, with its error; the first one adds what it finds, see :func:`_format_together`."""
+    from egvs.scenario.score_config import DEFAULT_SCORE
+
+    is_share_found = row.gain == row.score and by.name == DEFAULT_SCORE
+    return by.change(row.gain) if is_share_found else by.change(row.gain, row.gain_se)
 
 
 def _format_together(by: ScoreLabel, row: PlannedSensor | PlanStep) -> str:
