@@ -65,7 +65,7 @@ def accept(
         typer.Option(
             metavar="FILE",
             help="Required: a measured scan in the sensor's frame (x forward, y left, z up, metres): .pcd, .ply, .las,"
-            " .laz, .csv (x_m, y_m, z_m), .e57, .bin or .npz. Several scans, minutes apart: --scan A --scan B --scan C.",
+            " .laz, .csv (x_m, y_m, z_m), .e57, .bin or .npz. Several, minutes apart: --scan A --scan B --scan C.",
         ),
     ] = None,
     site: Annotated[str, typer.Option(metavar="SITE", help="Required: the site, or the pole, of the sensor.")] = "",
