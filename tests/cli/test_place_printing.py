@@ -132,9 +132,7 @@ def test_a_plan_takes_at_most_250_words(capsys: pytest.CaptureFixture[str]) -> N
     fused = FusedPlan(steps, ("c", "a"), steps[2], searched=True, noticed=NoticedShare(0.985, 0.011, 0.985, 0.985))
     files = tuple(Path("runs/r", name) for name in ("placement.parquet", "curve.parquet", "report.html"))
     placed = replace(two, sensors=sensors, curve=steps, fused=fused, files=files)
-    caveat = (
-        "Assumed, not measured: traffic (1,240 vehicles an hour in 12 movements); positions of the poles; 1 more."
-    )
+    caveat = "Assumed, not measured: traffic (1,240 vehicles an hour in 12 movements); positions of the poles; 1 more."
     place.print_placement(placed, ["replaces the plan for --count 2"], [caveat], CLUSTER)
     assert len(capsys.readouterr().out.split()) <= 250
 
