@@ -149,7 +149,7 @@ def _meaning(source: str) -> str:
 def replace_code(mutant: Mutant) -> None:
     """Give an imported module the code of a mutant.
 
-    A change in a function becomes that of the function that is there, wherever it was imported. Other code of the
+    A function that is there, wherever it was imported, gets the code of the changed one. For changes elsewhere, the
     module is executed again; what other modules imported from it is replaced.
     """
     changed = importlib.import_module(f"egvs.{mutant.module.replace('/', '.')}")
@@ -157,10 +157,9 @@ def replace_code(mutant: Mutant) -> None:
     code = compile(mutant.code, str(SOURCE / f"{mutant.module}.py"), "exec")
     if mutant.function != WHOLE_MODULE:
         exec(code, after := {name: before[name] for name in ("__name__", "__file__", "__package__")})
-        for name, old in before.items():
-            if name in after:
-                _replace_functions(old, after[name], mutant.function)
-        return
+        names = [name for name in before if name in after and before[name] is not after[name]]
+        if any([_replace_functions(before[name], after[name], mutant.function) for name in names]):
+            return
     exec(code, vars(changed))
     for other in list(sys.modules.values()):
         for name, value in list(getattr(other, "__dict__", {}).items()):
@@ -168,18 +167,21 @@ def replace_code(mutant: Mutant) -> None:
                 setattr(other, name, vars(changed)[name])
 
 
-def _replace_functions(old: object, new: object, lines: range) -> None:
-    """Give a function, or the methods of a class, the code of another one, if it begins in a range of lines."""
+def _replace_functions(old: object, new: object, lines: range) -> bool:
+    """Give a function, or the methods of a class, the code of another one, if it begins in a range of lines.
+
+    Returns whether any did.
+    """
     if isinstance(old, type) and isinstance(new, type):
-        for name, value in vars(new).items():
-            if not isinstance(value, type):
-                _replace_functions(vars(old).get(name), value, lines)
-        return
-    for part in ("__func__", "func", "fget", "__wrapped__"):
-        if hasattr(old, part) and hasattr(new, part):
-            _replace_functions(getattr(old, part), getattr(new, part), lines)
+        pairs = [(vars(old).get(name), value) for name, value in vars(new).items() if not isinstance(value, type)]
+    else:
+        parts = [part for part in ("__func__", "func", "fget", "__wrapped__") if hasattr(old, part)]
+        pairs = [(getattr(old, part), getattr(new, part)) for part in parts if hasattr(new, part)]
+    replaced = [_replace_functions(*pair, lines) for pair in pairs]
     if isinstance(old, FunctionType) and isinstance(new, FunctionType) and new.__code__.co_firstlineno in lines:
         old.__code__, old.__defaults__, old.__kwdefaults__ = new.__code__, new.__defaults__, new.__kwdefaults__
+        return True
+    return any(replaced)
 
 
 class _Tests:

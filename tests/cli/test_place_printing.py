@@ -75,7 +75,7 @@ def test_shares_are_per_cent_with_errors_in_percentage_points(capsys: pytest.Cap
     first, second = (line for line in text.splitlines() if line.startswith(("1", "2")))
     assert "4.7 ± 0.5          99.2 %                         4.0" in second
     assert "±" not in first  # the error of a share is mostly that of its level, which is in the first sentence
-    assert "Every other ± is one standard error, from 10 blocks of 100 frames" in text
+    assert "± of differences and zones is one standard error, from 10 blocks of 100 frames" in text
 
 
 @pytest.mark.parametrize("width", [80, 160])
@@ -120,7 +120,7 @@ def test_the_curve_is_printed_only_where_it_has_other_sites(capsys: pytest.Captu
     assert "sensors  found together" not in printed(placed_two(), capsys)
     text = printed(placed_two(sites=(("c",), ("a", "b"))), capsys)
     rows = text.partition("sensors  found together")[2].splitlines()
-    assert [row.split()[0] for row in rows[1:4]] == ["1", "2", "Every"]  # the plan itself is a row, too
+    assert [row.split()[0] for row in rows[1:4]] == ["1", "2", "±"]  # the plan itself is a row, too
 
 
 def test_a_plan_takes_at_most_250_words(capsys: pytest.CaptureFixture[str]) -> None:
@@ -272,6 +272,6 @@ def test_sensor_with_a_price_and_no_site_is_named(mini: Path, run_egvs: Any) -> 
     assert code == 0 and "No plan has" not in text
     one_each = ("--budget", "30000", "--set", "placement.most_per_pole=1")
     code, text, _ = run_egvs("place", mini, "--out", mini / "out", *one_each)
-    assert code == 0 and "small was a candidate, too: no better plan has it." in text
+    assert code == 0 and "small was a candidate, too, but is not in this plan." in text
     rules = "The limit of 1 sensor per pole (most_per_pole) and the budget forbid a third sensor beside them."
     assert rules in " ".join(text.split())

@@ -27,15 +27,20 @@ TO_NORTH, TO_SOUTH, TO_EAST, TO_WEST = "1002#1", "-1002#0", "1001#1", "-1001#0"
 Read = Callable[..., StreetCounts]
 
 
-@pytest.fixture(scope="module")
-def crossing() -> tuple[Streets, StreetJunction]:
-    """North Street and East Street cross."""
-    extract = osm.read_osm(SMALL)
+def largest_junction(path: Path) -> tuple[Streets, StreetJunction]:
+    """The largest junction of an OpenStreetMap extract."""
+    extract = osm.read_osm(path)
     flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
-    _, streets, _ = street_network.build_network(extract, SMALL, flags)
+    _, streets, _ = street_network.build_network(extract, path, flags)
     junction = junctions.largest_junctions(streets)[0]
     assert junction is not None
     return streets, junction
+
+
+@pytest.fixture(scope="module")
+def crossing() -> tuple[Streets, StreetJunction]:
+    """North Street and East Street cross."""
+    return largest_junction(SMALL)
 
 
 @pytest.fixture
@@ -77,13 +82,7 @@ def bend(tmp_path_factory: pytest.TempPathFactory) -> tuple[Streets, StreetJunct
         street("Main Street", 2, 3, road_class="primary"),
         MapWay((2, 4), {"highway": "primary_link", "oneway": "no"}),
     ]
-    path = write_map(tmp_path_factory.mktemp("bend") / "bend.osm", nodes, ways)
-    extract = osm.read_osm(path)
-    flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
-    _, streets, _ = street_network.build_network(extract, path, flags)
-    junction = junctions.largest_junctions(streets)[0]
-    assert junction is not None
-    return streets, junction
+    return largest_junction(write_map(tmp_path_factory.mktemp("bend") / "bend.osm", nodes, ways))
 
 
 def test_straight_on_is_the_turn_that_stays_on_the_street(bend: tuple[Streets, StreetJunction], tmp_path: Path) -> None:

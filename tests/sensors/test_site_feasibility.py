@@ -31,9 +31,9 @@ def test_ground_below_a_pose_is_the_plane(at_m: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize("at_m", [(31.0, 0.0), (0.0, -21.0), (500.0, 500.0)])
-def test_ground_beside_the_terrain_is_0(at_m: tuple[float, float]) -> None:
+def test_height_outside_the_terrain_is_zero(at_m: tuple[float, float]) -> None:
     assert site_feasibility.ground_height_m(slope(), Pose(*at_m, 9.0)) == 0.0
 
 
-def test_a_roof_is_no_ground() -> None:
+def test_ignores_roofs() -> None:
     assert site_feasibility.ground_height_m(slope("roof", "building"), Pose(0.0, 0.0, 9.0)) == 0.0

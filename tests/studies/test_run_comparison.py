@@ -362,7 +362,7 @@ def test_prints_how_to_set_costs(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "PRICE" not in text
     text = printed_text(by_pole(replace(a, costs=costs), made_run("B", *mounts("u", 0.95))), 160, monkeypatch)
     assert """'costs.sensor={"s" = PRICE, "u" = PRICE}'""" in text
-    assert "In reality, do not decide between sensors by less than about 10 points." in " ".join(text.split())
+    assert "Do not choose between real sensors by less than about 10 points." in " ".join(text.split())
 
 
 @pytest.mark.parametrize("width", [80, 160])
@@ -370,7 +370,7 @@ def test_sentences_are_broken_between_words(width: int, monkeypatch: pytest.Monk
     a, b = made_run("A", *mounts("s", 0.9)), made_run("B", *mounts("t", 0.95))
     comparison = by_pole(a, b)
     lines = printed_text(comparison, width, monkeypatch).splitlines()
-    first = next(number for number, line in enumerate(lines) if line.startswith("In reality, do not decide"))
+    first = next(number for number, line in enumerate(lines) if line.startswith("Do not choose between real"))
     paragraph = lines[first : lines.index("", first)]
     assert len(paragraph) >= 2
     assert max(map(len, paragraph)) <= width

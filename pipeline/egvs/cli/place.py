@@ -126,8 +126,8 @@ def _describe_unchosen_sensors(candidates: Collection[str], planned: Collection[
         return ""
     from egvs.results.labels import join_names
 
-    were = by_number(len(unchosen), "was a candidate", "were candidates")
-    return f"{join_names(unchosen)} {were}, too: no better plan has {by_number(len(unchosen), 'it', 'them')}."
+    were = by_number(len(unchosen), "was a candidate, too, but is", "were candidates, too, but are")
+    return f"{join_names(unchosen)} {were} not in this plan."
 
 
 def _plan_level(scenario: Scenario, folder: Path, placed: SensorPlan) -> DetectionLevel:
@@ -412,7 +412,7 @@ def describe_errors(placed: SensorPlan) -> str:
     from egvs.scenario.score_config import DEFAULT_SCORE
 
     if placed.has_errors:
-        subject = "Every other ±" if placed.by.name == DEFAULT_SCORE else "±"
+        subject = "± of differences and zones" if placed.by.name == DEFAULT_SCORE else "±"
         return f"{subject} is one standard error, from {placed.errors_from}"
     return f"no standard errors: {placed.errors_from}"
 

@@ -16,7 +16,7 @@ from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.sensors.return_model import REFLECTIVITY_INTERVAL
 from egvs.sensors.sensor import scenario_sensor
 
-_ADVICE = "In reality, do not decide between sensors by less than about 10 points."
+_ADVICE = "Do not choose between real sensors by less than about 10 points."
 
 SENSOR_EVIDENCE = (
     "How far to trust this: in simulation without losses of returns, at six held-out junctions with twelve sensors, "
