@@ -143,6 +143,29 @@ def test_reports_uncertain_beams(shape, voxel_m, o):
 
 
 @pytest.mark.parametrize("axes", list(itertools.permutations(range(3))))
+def test_beam_that_misses_an_edge_is_certain(axes):
+    """By more than the margin, 4e-6 voxels; a long beam, too."""
+    axes = list(axes)
+    shape = np.array(GRID, np.int64)[axes]
+    for missed, count in ((1e-3, 0), (1e-5, 0), (1e-6, -1)):
+        o, d = np.array([-50.0, GRID[1] + missed - 50.0, 0.5])[axes], np.array([100.0, 100.0, 0.0])[axes]
+        near = traversal.make_tolerances(o, shape, traversal.CHORD_M / VOXEL_M)
+        assert traversal.traverse_fixed_point(o, d, shape, near, traversal.cell_buffer(shape)) == count
+
+
+@pytest.mark.parametrize("roundings_beyond", [-2.0, -0.5, 2.0])
+@pytest.mark.parametrize("ahead", [-1.0, 1.0])
+def test_end_counts_as_no_contact_only_where_rounding_cannot_change_that(ahead, roundings_beyond):
+    """Half a chord behind a plane, or less than a rounding nearer: not certain. Two roundings nearer: certain."""
+    shape = np.array([60, 40, 10], np.int64)
+    o = np.array([20.5, 20.5, 4.5])
+    near, cells = traversal.make_tolerances(o, shape, traversal.CHORD_M / VOXEL_M), traversal.cell_buffer(shape)
+    d = np.array([ahead * (9.5 + 0.499 * near.chord + roundings_beyond * near.rounding), 0.0, 0.0])
+    count = traversal.traverse_fixed_point(o, d, shape, near, cells)
+    assert count == (10 if roundings_beyond == -2.0 else -1)
+
+
+@pytest.mark.parametrize("axes", list(itertools.permutations(range(3))))
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_margins_are_as_wide_as_the_bounds_and_hardly_wider(axes, side):
     """With S = 60 + 70: 16 u S for rounding; beside it the chord, and a digit for the start and for each step."""

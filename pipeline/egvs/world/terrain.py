@@ -293,12 +293,7 @@ def triangulate(vertices: FloatArray, origin: FloatArray) -> IntArray:
     from scipy.spatial import Delaunay
 
     faces = np.asarray(Delaunay(vertices[:, :2] - origin).simplices, dtype=np.int64)
-    ax, ay = vertices[faces[:, 0], :2].T
-    bx, by = vertices[faces[:, 1], :2].T
-    cx, cy = vertices[faces[:, 2], :2].T
-    is_down = (bx - ax) * (cy - ay) < (by - ay) * (cx - ax)
-    faces[is_down] = faces[is_down][:, [0, 2, 1]]
-    # each face from its lowest vertex, faces sorted: the result does not depend on Qhull's order
+    # SciPy's triangles are counter-clockwise. Each from its lowest vertex, and sorted: Qhull's order does not matter.
     first = np.argmin(faces, axis=1)
     faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
     return faces[np.lexsort(faces.T[::-1])]
