@@ -133,6 +133,16 @@ def test_nothing_lost_is_the_plain_result() -> None:
     assert (np.abs(result.hole_m - plain.hole_m) <= BOXES[:, 3] / 64).all()
 
 
+def test_slices_without_losses_are_those_of_the_points() -> None:
+    """Of the length each slice with a point; of the width those with the outermost points."""
+    misses = slice_misses(visible(None))
+    for i, (_, along_m, across_m) in enumerate(points_of(fan(POSE))):
+        for axis, at_m in enumerate((along_m, np.array([across_m.min(), across_m.max()]))):
+            parts = np.unique(np.floor(64 * (at_m / (BOXES[i, 3 + axis] - 2e-4) + 0.5)).clip(0, 63).astype(int))
+            assert np.flatnonzero(misses[i, axis] == 0.0).tolist() == parts.tolist()
+    assert set(np.unique(misses)) == {0.0, 1.0}
+
+
 def test_fused_sensors_miss_a_slice_if_each_does() -> None:
     here, there = Pose(101.0, 206.0, 3.0), Pose(118.0, 212.0, 3.0)
     record = TargetRecord.of([frame(BOXES)], GRID)

@@ -27,6 +27,7 @@ NET = """<net version="1.20">
         shape="30,-6 30,6"/></edge>
     <edge id="out" from="a" to="j"><lane id="out_0" index="0" allow="pedestrian" width="2" length="40"
         shape="0,-5 40,-5"/><lane id="out_1" index="1" disallow="pedestrian" length="40" shape="0,-2 40,-2"/></edge>
+    <edge id="rail" from="a" to="r"><lane id="rail_0" index="0" allow="rail" length="15" shape="0,6 15,6"/></edge>
     <edge id="up" from="j" to="n"><lane id="up_0" index="0" length="30" shape="22,3,0 22,10,0.7"/></edge>
     <junction id="j" type="priority" x="20" y="0" incLanes="" intLanes="" shape="18,-4 22,-4 22,4 18,4"/>
 </net>
@@ -104,6 +105,7 @@ def test_cars_stand_on_lanes_and_people_on_every_surface(streets: Network) -> No
     car_cells, people_cells = set(map(tuple, cars.cells.tolist())), set(map(tuple, people.cells.tolist()))
     assert {(5, iy) for iy in range(20) if (5, iy) in car_cells} == {(5, 6), (5, 7), (5, 8), (5, 9)}
     assert {(5, iy) for iy in range(20) if (5, iy) in people_cells} == {(5, iy) for iy in (4, 5, 6, 7, 8, 9)}
+    assert (5, 16) not in people_cells  # tracks
     assert (30, 14) in people_cells  # the crossing
     assert (30, 14) not in car_cells
     assert car_cells < people_cells
@@ -111,6 +113,7 @@ def test_cars_stand_on_lanes_and_people_on_every_surface(streets: Network) -> No
 
 def test_boxes_follow_their_lanes_and_stand_on_them(streets: Network) -> None:
     cars = TargetPositions.of(CAR, streets, GRID)
+    assert cars.boxes[(cars.cells == (5, 8)).all(axis=1), :2].tolist() == [[5.5, -1.5]]
     north = (cars.cells == (21, 18)).all(axis=1)
     assert cars.boxes[north, 6] == pytest.approx([np.pi / 2])
     assert cars.boxes[north, 2] == pytest.approx([0.55 + 0.75])  # the lane climbs by 0.1 m a metre from y = 3
