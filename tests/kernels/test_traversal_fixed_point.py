@@ -153,6 +153,37 @@ def test_beam_that_misses_an_edge_is_certain(axes):
         assert traversal.traverse_fixed_point(o, d, shape, near, traversal.cell_buffer(shape)) == count
 
 
+def count_along(axis, start, extent, beside=0.5, drift=0.0):
+    """Number of voxels that the fixed-point traversal lists for a segment along an axis of the grid."""
+    shape, o, d = np.array(GRID, np.int64), np.full(3, beside), np.full(3, drift)
+    o[axis], d[axis] = start, extent
+    near = traversal.make_tolerances(o, shape, traversal.CHORD_M / VOXEL_M)
+    return traversal.traverse_fixed_point(o, d, shape, near, traversal.cell_buffer(shape))
+
+
+@pytest.mark.parametrize("plane", [1, 2, 9])
+@pytest.mark.parametrize("axis", range(3))
+def test_segment_that_begins_or_ends_near_a_plane_is_not_certain(axis, plane):
+    """Within the margin of 4e-6; exactly on it, or half a chord behind it at the end, it is."""
+    for ahead in (-1.0, 1.0):
+        to_border = plane + 1.5 if ahead < 0 else GRID[axis] - plane + 1.5
+        voxels = plane if ahead < 0 else GRID[axis] - plane
+        for aside in (-3e-6, 3e-6):
+            assert count_along(axis, plane + aside, ahead * to_border) == -1
+        assert count_along(axis, plane, ahead * to_border) == voxels
+        assert count_along(axis, plane - ahead * to_border, ahead * (to_border + 3e-6)) == -1
+        assert count_along(axis, plane - 0.5 * ahead, ahead * (0.5 + 1e-6)) == 1
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_segments_beside_the_grid_and_of_one_voxel(axis):
+    assert count_along(axis, -0.5, 1.0) == 1
+    assert count_along(axis, -0.5, 5.0, beside=-0.5) == 0
+    assert count_along(axis, 0.5, 5.0, beside=-0.5) == 0
+    assert count_along(axis, 0.5, 5.0, beside=GRID[0] + 0.5) == 0
+    assert count_along(axis, 0.25, 1.0, drift=1.0) == -1, "through edges and corners"
+
+
 @pytest.mark.parametrize("roundings_beyond", [-2.0, -0.5, 2.0])
 @pytest.mark.parametrize("ahead", [-1.0, 1.0])
 def test_end_counts_as_no_contact_only_where_rounding_cannot_change_that(ahead, roundings_beyond):
