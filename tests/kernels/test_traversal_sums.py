@@ -82,6 +82,25 @@ def test_voxel_that_is_entered_at_a_fall_gets_the_amount_before_it():
     assert hits.sum() == 34
 
 
+def test_diagonal_has_no_voxels_beside_it_and_a_miss_has_none():
+    """Through corners: the voxels beside it have chords of 0; it enters voxels at 1/6, 3/6 and 5/6."""
+    o, shape, hits = np.full(3, 0.5), np.array(SHAPE), np.zeros(SHAPE, np.int64)
+    t_falls, amounts, times = np.array([0.5, np.inf]), np.array([8, 1]), traversal.crossing_buffer(shape)
+    traversal.add_stepwise(o, np.array([3.0, 3.0, 0.0]), shape, VOXEL_M, t_falls, amounts, hits.reshape(-1), times)
+    traversal.add_stepwise(o - 4, np.array([3.0, 3.0, 0.0]), shape, VOXEL_M, t_falls, amounts, hits.reshape(-1), times)
+    assert np.argwhere(hits).tolist() == [[0, 0, 0], [1, 1, 0], [2, 2, 0], [3, 3, 0]]
+    assert hits[hits > 0].tolist() == [8, 8, 8, 1]
+
+
+def test_contact_of_less_than_a_micrometre_counts_for_no_beam():
+    """Past an edge: 1.4e-6 voxels of 0.25 m."""
+    o, d, shape = np.array([0.5, 0.5 + 1e-6, 0.5]), np.array([[1.0, 1.0, 0.0]]), np.array(SHAPE)
+    hits, weighted = np.zeros(SHAPE, np.uint32), np.zeros(SHAPE, np.int64)
+    traversal.count_hits(o, d, shape, VOXEL_M, hits.reshape(-1))
+    traversal.add_hits(o, d, shape, VOXEL_M, np.array([5]), weighted.reshape(-1))
+    assert np.argwhere(hits).tolist() == np.argwhere(weighted).tolist() == [[0, 0, 0], [1, 1, 0]]
+
+
 @pytest.mark.parametrize(("length_m", "contacts"), [(1e-6, 0), (1.01e-6, 1)])
 def test_chord_of_a_micrometre_is_no_contact(length_m, contacts):
     o, d, shape = np.array([2.5, 2.5, 1.5]), np.array([0.0, length_m, 0.0]), np.array(SHAPE)  # in voxels of 1 m
