@@ -155,6 +155,16 @@ def test_sweeps_meet_what_no_beam_towards_the_region_meets(mini: Path) -> None:
     assert behind_m[:, 0] == pytest.approx(-13.0, abs=1e-6)
 
 
+def test_sweep_ends_in_leaves_behind_the_region(mini: Path) -> None:
+    """One crown stands before the region, so that foliage acts; the other, 10 m behind the only site."""
+    crowns = prism(0, -4, 4, 4, 0, 5, "tree_crown", "a"), prism(-25, -4, -15, 4, 0, 5, "tree_crown", "b")
+    folder = write_scene(mini, *crowns, sites="before,-5,0,3\n")
+    scene = egvs.build_scene(egvs.load(folder, ["effects.foliage.leaf_area_density=1"]))
+    rows = Scanner(scene, full_sweep=True).scan_site(scene.sites[0]).rows
+    x_m = rows.ends_m[rows.returned & (np.abs(rows.ends_m[:, 1]) < 0.1) & (rows.ends_m[:, 2] > -2.0), 0]
+    assert np.count_nonzero((x_m > -20.0) & (x_m < -10.0)) > 10
+
+
 def test_box_around_a_full_sweep_holds_the_world_and_the_region(scene: Scene) -> None:
     box = _bounding_roi(scene)
     low_m, region_m = np.array(box.origin_m), np.array(scene.roi.origin_m)
