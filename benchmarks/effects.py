@@ -38,7 +38,12 @@ COSTS: dict[str, tuple[list[str], float | None]] = {
     "moving_occlusion, 500 frames": (["effects.moving_occlusion.frames=500"], 4.0),
     "divergence, 7 sub-beams": (["effects.divergence.sub_beams=7"], 5.0),
 }
-"""Settings, and the largest allowed ratio to the plain scene."""
+"""Settings, and the largest allowed ratio to the plain scene.
+
+The last two are above it. What did not help: marking the frames of a box for all beams of a bundle at once; the
+fixed-point traversal for shares that fall along a beam, as finding where costs what it saves; one slab around the
+sub-beams of a beam, as few voxels are crossed by all of them.
+"""
 
 MAX_LOSSES_RATIO = 1.3
 """Largest allowed ratio of all scores of a site with losses of returns to those without."""
