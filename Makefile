@@ -114,7 +114,7 @@ bench-history: $(VENV)/.installed-dev
 
 # Peers that are not installed are left out by name; "pip install egvs[peers]" installs them, Open3D alone takes 900 MB.
 bench-peers: $(VENV)/.installed-dev
-	$(BIN)/python -m benchmarks.peers
+	$(BIN)/python -m benchmarks.peers $(PEERS)
 
 scaling: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.scaling

@@ -20,15 +20,18 @@ A voxel differs if its number of beams does; with octomap, if only one of both c
 ours are correct.
 
 A peer that is not installed is left out by name: ``pip install "egvs[peers]"`` installs them all, ``pip install NAME``
-one of them. Open3D takes 900 MB.
+one of them. Open3D takes 900 MB. ``--csv FILE`` writes the table of the documentation.
 """
 
 from __future__ import annotations
 
+import argparse
+import csv
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -193,12 +196,12 @@ def octomap_count(junction: Junction) -> Count:
 
 
 CASTS: dict[str, tuple[str, Callable[[Junction], Cast]]] = {
-    "embreex": ("embreex", embreex_cast),
+    "embreex, one ray at a time": ("embreex", embreex_cast),
     "Open3D RaycastingScene": ("open3d", open3d_cast),
 }
 COUNTS: dict[str, tuple[str, Callable[[Junction], Count]]] = {
-    "taichi": ("taichi", taichi_count),
-    "octomap, insertion of the scan": ("octomap", octomap_count),
+    "Amanatides and Woo with accumulated t": ("taichi", taichi_count),
+    "insertion of the scan in an octree": ("octomap", octomap_count),
 }
 """Module and maker of each peer, by its name in the table."""
 
@@ -269,7 +272,10 @@ def _rows(
             table.append((f"{what}: ours", "1 x", f"{1e3 * seconds[name] / len(junction.sites):.1f} ms a site"))
             continue
         difference = _describe_difference(what, method, junction)
-        table.append((f"{what}: {name}", f"{seconds[name] / seconds['ours']:.2f} x", difference))
+        module = peers[name][0]
+        package = PACKAGES.get(module, module)
+        peer = f"{what}: {name}, {package} {version(package)}"
+        table.append((peer, f"{seconds[name] / seconds['ours']:.3g} x", difference))
     return table + left_out
 
 
@@ -287,10 +293,17 @@ def _describe_difference(what: str, method: Callable[[SiteBeams], Any], junction
     return f"{wrong} voxels differ, of {crossed} that beams cross"
 
 
-def main() -> None:
-    """Print the table."""
-    for row in rows(Junction.load()):
-        print("  ".join(f"{cell:<44}" for cell in row).rstrip())
+def main(arguments: list[str] | None = None) -> None:
+    """Print the table, and write it if a file is given."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__)
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="write the table there too")
+    chosen = parser.parse_args(arguments)
+    table = rows(Junction.load())
+    for row in table:
+        print("  ".join(f"{cell:<74}" for cell in row).rstrip())
+    if chosen.csv is not None:
+        with chosen.csv.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([("peer", "processor time", "difference"), *table])
 
 
 if __name__ == "__main__":

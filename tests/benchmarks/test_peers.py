@@ -65,7 +65,7 @@ def test_what_takes_longer_takes_longer() -> None:
 
 
 @pytest.mark.system  # taichi starts a process
-@pytest.mark.parametrize(("module", "make"), [peers.COUNTS["taichi"], peers.COUNTS["octomap, insertion of the scan"]])
+@pytest.mark.parametrize(("module", "make"), list(peers.COUNTS.values()))
 def test_a_traversal_of_a_peer_is_nearly_ours(tmp_path: Path, module: str, make: Any) -> None:
     pytest.importorskip(module, reason=f"{module} is a peer of make bench-peers, which nothing else needs")
     junction = peers.Junction.load(write_mini(tmp_path / "mini"), sites=1)
