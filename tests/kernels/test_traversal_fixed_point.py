@@ -164,7 +164,7 @@ def count_along(axis, start, extent, beside=0.5, drift=0.0):
 @pytest.mark.parametrize("plane", [1, 2, 9])
 @pytest.mark.parametrize("axis", range(3))
 def test_segment_that_begins_or_ends_near_a_plane_is_not_certain(axis, plane):
-    """Within the margin of 4e-6; exactly on it, or half a chord behind it at the end, it is."""
+    """Within the margin of 4e-6; exactly on it, or less than half a chord behind it at the end, it is."""
     for ahead in (-1.0, 1.0):
         to_border = plane + 1.5 if ahead < 0 else GRID[axis] - plane + 1.5
         voxels = plane if ahead < 0 else GRID[axis] - plane
@@ -188,8 +188,7 @@ def test_segments_beside_the_grid_and_of_one_voxel(axis):
 @pytest.mark.parametrize("ahead", [-1.0, 1.0])
 def test_end_counts_as_no_contact_only_where_rounding_cannot_change_that(ahead, roundings_beyond):
     """Half a chord behind a plane, or less than a rounding nearer: not certain. Two roundings nearer: certain."""
-    shape = np.array([60, 40, 10], np.int64)
-    o = np.array([20.5, 20.5, 4.5])
+    shape, o = np.array(GRID, np.int64), np.array([20.5, 20.5, 4.5])
     near, cells = traversal.make_tolerances(o, shape, traversal.CHORD_M / VOXEL_M), traversal.cell_buffer(shape)
     d = np.array([ahead * (9.5 + 0.499 * near.chord + roundings_beyond * near.rounding), 0.0, 0.0])
     count = traversal.traverse_fixed_point(o, d, shape, near, cells)
