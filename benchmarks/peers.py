@@ -282,7 +282,7 @@ def _rows(
 def _describe_difference(what: str, method: Callable[[SiteBeams], Any], junction: Junction) -> str:
     if what == "cast":
         wrong = sum(differing_ranges(method(site), site) for site in junction.sites)
-        return f"{wrong} of {sum(len(site.directions) for site in junction.sites)} beams differ"
+        return f"{wrong:,} of {sum(len(site.directions) for site in junction.sites):,} beams differ"
     wrong, crossed = 0, 0
     for site in junction.sites:
         result = method(site)
@@ -290,7 +290,7 @@ def _describe_difference(what: str, method: Callable[[SiteBeams], Any], junction
             result = result()
         ours = junction.count_hits(site)
         wrong, crossed = wrong + differing_voxels(result, ours), crossed + int((ours > 0).sum())
-    return f"{wrong} voxels differ, of {crossed} that beams cross"
+    return f"{wrong:,} voxels differ, of {crossed:,} that beams cross"
 
 
 def main(arguments: list[str] | None = None) -> None:
