@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,23 @@ def test_peers_that_are_missing_are_left_out_by_name(tmp_path: Path, monkeypatch
         ("traversal: octomap", "left out"),
     ]
     assert table[1][2] == "not installed; try pip install no_such_module_anywhere"
+
+
+def test_written_table_has_each_row_with_its_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    junction = peers.Junction.load(write_mini(tmp_path / "mini"), sites=1)
+    monkeypatch.setattr(peers, "CASTS", {"embreex": peers.CASTS["embreex, one ray at a time"]})
+    monkeypatch.setattr(peers, "COUNTS", {})
+    monkeypatch.setattr(peers.Junction, "load", lambda: junction)
+    peers.main(["--csv", str(tmp_path / "peers.csv")])
+    with (tmp_path / "peers.csv").open(encoding="utf-8", newline="") as file:
+        heading, *table = csv.reader(file)
+    assert tuple(heading) == peers.HEADINGS
+    assert [row[0] for row in table] == [
+        "cast: ours",
+        f"cast: embreex, embreex {version('embreex')}",
+        "traversal: ours",
+    ]
+    assert float(table[1][1].removesuffix(" x")) > 0
 
 
 def test_embree_hits_what_we_hit(tmp_path: Path) -> None:

@@ -153,9 +153,12 @@ def test_beam_that_misses_an_edge_is_certain(axes):
         assert traversal.traverse_fixed_point(o, d, shape, near, traversal.cell_buffer(shape)) == count
 
 
-def count_along(axis, start, extent, beside=0.5, drift=0.0):
-    """Number of voxels that the fixed-point traversal lists for a segment along an axis of the grid."""
-    shape, o, d = np.array(GRID, np.int64), np.full(3, beside), np.full(3, drift)
+def count_along(axis, start, extent, others=0.5, drift=0.0):
+    """Number of voxels that the fixed-point traversal lists for a segment along an axis of the grid.
+
+    ``others`` and ``drift``: start and extent along the other two axes.
+    """
+    shape, o, d = np.array(GRID, np.int64), np.full(3, others), np.full(3, drift)
     o[axis], d[axis] = start, extent
     near = traversal.make_tolerances(o, shape, traversal.CHORD_M / VOXEL_M)
     return traversal.traverse_fixed_point(o, d, shape, near, traversal.cell_buffer(shape))
@@ -176,11 +179,11 @@ def test_segment_that_begins_or_ends_near_a_plane_is_not_certain(axis, plane):
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_segments_beside_the_grid_and_of_one_voxel(axis):
+def test_segments_outside_the_grid_and_across_a_face(axis):
     assert count_along(axis, -0.5, 1.0) == 1
-    assert count_along(axis, -0.5, 5.0, beside=-0.5) == 0
-    assert count_along(axis, 0.5, 5.0, beside=-0.5) == 0
-    assert count_along(axis, 0.5, 5.0, beside=GRID[0] + 0.5) == 0
+    assert count_along(axis, -0.5, 5.0, others=-0.5) == 0
+    assert count_along(axis, 0.5, 5.0, others=-0.5) == 0
+    assert count_along(axis, 0.5, 5.0, others=GRID[0] + 0.5) == 0
     assert count_along(axis, 0.25, 1.0, drift=1.0) == -1, "through edges and corners"
 
 

@@ -82,8 +82,8 @@ def test_voxel_that_is_entered_at_a_fall_gets_the_amount_before_it():
     assert hits.sum() == 34
 
 
-def test_diagonal_has_no_voxels_beside_it_and_a_miss_has_none():
-    """Through corners: the voxels beside it have chords of 0; it enters voxels at 1/6, 3/6 and 5/6."""
+def test_diagonal_crosses_four_voxels_and_a_miss_none():
+    """Through corners: its chords with all other voxels are 0. It enters voxels at 1/6, 3/6 and 5/6."""
     o, shape, hits = np.full(3, 0.5), np.array(SHAPE), np.zeros(SHAPE, np.int64)
     t_falls, amounts, times = np.array([0.5, np.inf]), np.array([8, 1]), traversal.crossing_buffer(shape)
     traversal.add_stepwise(o, np.array([3.0, 3.0, 0.0]), shape, VOXEL_M, t_falls, amounts, hits.reshape(-1), times)

@@ -47,7 +47,7 @@ def test_sensor_stands_in_the_highest_lane_below_it(roads: Carriageway) -> None:
     assert roads.lanes_at(at_m) == [ROAD, ROAD, None, ROAD, BRIDGE, None, None]
 
 
-def test_heights_beside_the_centre_line(roads: Carriageway) -> None:
+def test_height_is_that_of_the_nearest_point_of_the_centre_line(roads: Carriageway) -> None:
     at_m = np.array([[30, 1.5], [60, -1], [80, 0], [-9, 0], [140, 3]])
     assert [roads.height_m(ROAD, at) for at in at_m] == pytest.approx([1.5, 3, 3.5, 0, 4])
     assert sorted(roads.heights_in((45, -2), (55, 2))) == pytest.approx([2.5, 9])
@@ -64,7 +64,7 @@ def test_rectangles(roads: Carriageway) -> None:
     assert roads.nearest(np.array([40, 12])) == BRIDGE
 
 
-def test_junctions_are_without_their_kerbs_and_walking_areas(roads: Carriageway) -> None:
+def test_junction_interiors_exclude_kerbs_and_walking_areas(roads: Carriageway) -> None:
     at_m = np.array([[105, 0], [105, 8], [100 + 0.9 * LANE_INSET_M, 0], [100 + 1.1 * LANE_INSET_M, 0], [111, 0]])
     assert roads.in_junctions(at_m).tolist() == [True, False, False, True, False]
 
